@@ -1,0 +1,160 @@
+"""What a robot and a camera are to spherecal. Adapters satisfy these protocols; nothing inherits from them.
+
+Units are mm, rad and s; `base_from_flange` follows `drivers.kinematics.se3`. A device object does no I/O in its
+constructor: `open` connects, `close` may be called any number of times, and one thread owns it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from types import TracebackType
+from typing import Literal, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Safety(Enum):
+    """What the controller says about its safety state."""
+
+    NORMAL = "normal"
+    PROTECTIVE_STOP = "protective_stop"
+    EMERGENCY_STOP = "emergency_stop"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotInfo:
+    """Identity of a robot, as far as its controller tells it."""
+
+    adapter: str
+    model: str | None = None
+    serial: str | None = None
+    controller: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotState:
+    """One fresh reading of a robot."""
+
+    joints_rad: FloatArray | None
+    """(n,) reported axis angles, or None where the controller does not give them."""
+    base_from_flange: FloatArray | None
+    """(4, 4) flange pose as the controller reports it, or None."""
+    time_s: float
+    """`time.monotonic()` of the reading (simulated cells: their own clock)."""
+    moving: bool
+    safety: Safety = Safety.NORMAL
+    mode: str = "automatic"
+
+
+@runtime_checkable
+class Robot(Protocol):
+    """A robot arm that can be read, moved and stopped."""
+
+    def open(self) -> RobotInfo:
+        """Connect. Raises RobotNotReached or RobotTimeout within 3 s when nobody answers."""
+        ...
+
+    def read_state(self) -> RobotState:
+        """A fresh reading (never a stale one), or RobotNotReached / RobotTimeout."""
+        ...
+
+    def start_move(self, joints_rad: FloatArray, *, speed_rad_s: float) -> None:
+        """Start a motion to axis angles (n,) and return at once; raises MotionRefused or SafetyStop."""
+        ...
+
+    def stop(self) -> None:
+        """Stop now, in any state; returns when the controller has the command."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass: real robots sleep, simulated ones advance their clock (and may not sleep at all)."""
+        ...
+
+    def close(self) -> None:
+        """Release the robot; safe to call twice and after errors."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """Identity that a calibration is bound to."""
+
+    adapter: str
+    model: str | None = None
+    serial: str | None = None
+    firmware: str | None = None
+    settings_digest: str | None = None
+    onboard_correction: str | None = None
+    working_range_mm: tuple[float, float] | None = None
+    kind: Literal["area", "line_profile"] = "area"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame3D:
+    """One triggered exposure: owned arrays, mm, camera frame (x right, y down, z out), NaN where invalid."""
+
+    xyz_mm: NDArray[np.float32]
+    """(height, width, 3), C-contiguous; unorganised sources give (1, n, 3)."""
+    sequence: int
+    """Strictly rising per connection: proves that the frame follows its trigger."""
+    time_s: float
+    """`time.monotonic()` of the trigger (simulated cells: their own clock)."""
+    intensity: NDArray[np.float32] | None = None
+    """(height, width), 0..1."""
+    temperatures_c: Mapping[str, float] = field(default_factory=dict)
+
+
+@runtime_checkable
+class Camera3D(Protocol):
+    """A 3D camera that gives one fresh frame per call."""
+
+    def open(self) -> CameraInfo:
+        """Connect and apply the settings."""
+        ...
+
+    def capture(self, *, timeout_s: float) -> Frame3D:
+        """A frame exposed after this call, or a CameraError; never None, never an older frame."""
+        ...
+
+    def close(self) -> None:
+        """Release the camera; safe to call twice and after errors."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """The robot and the camera of one cell, opened and closed together.
+
+    The robot is stopped when the block ends by an exception: a program that lost its way must not leave a moving arm.
+    """
+
+    robot: Robot
+    camera: Camera3D
+
+    def __enter__(self) -> Self:
+        """Open both; the robot is closed again when the camera fails."""
+        self.robot.open()
+        try:
+            self.camera.open()
+        except BaseException:
+            self.robot.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Stop the robot on any exception, then close both."""
+        try:
+            if kind is not None:
+                self.robot.stop()
+        finally:
+            try:
+                self.camera.close()
+            finally:
+                self.robot.close()
