@@ -21,7 +21,7 @@ help:
 # The environment follows pyproject.toml and nothing else; the packages are installed editable.
 $(VENV)/.installed: pyproject.toml tools/environment.sh | system
 	@PYTHON="$(PYTHON)" sh tools/environment.sh create $(VENV)
-	@echo "Installing spherecal and what it needs into $(VENV) (about 1.6 GB; some minutes the first time) ..."
+	@echo "Installing spherecal and what it needs into $(VENV) (about 1.8 GB; some minutes the first time) ..."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
