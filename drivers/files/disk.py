@@ -62,7 +62,7 @@ def sha256_hex(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def write_atomic(path: str | Path, data: bytes) -> None:
+def write_atomic(path: str | Path, *chunks: bytes | memoryview) -> None:
     """Write a file in one step: temporary file beside it, fsync, rename, fsync of the folder.
 
     A killed or failing write leaves the former file, or none.
@@ -78,7 +78,8 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     try:
         with open(descriptor, "wb") as stream:
             os.fchmod(stream.fileno(), 0o666 & ~_umask())
-            stream.write(data)
+            for chunk in chunks:
+                stream.write(chunk)
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, target)
