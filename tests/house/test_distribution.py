@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.dependencies import canonical, direct_names, third_party_text
 from tests.support.source import LAYERS, ROOT
 
 NOT_SHIPPED = {".pyc"}
@@ -49,3 +50,8 @@ def test_the_wheel_holds_nothing_else(wheel_names: set[str]) -> None:
     assert {top for top in tops if not top.endswith(".dist-info")} == set(LAYERS)
     licences = {Path(name).name for name in wheel_names if "/licenses/" in name}
     assert licences == {"LICENSE", "THIRD_PARTY.md"}
+
+
+def test_third_party_names_what_we_ask_for() -> None:
+    text = canonical(third_party_text())
+    assert not [name for name in direct_names("dev") if name not in text]
