@@ -74,7 +74,8 @@ system)
     # Only Linux splits these off; ctypes is in every Python that has_venv accepts or Debian's stdlib package brings.
     [ "$(uname -s)" = Linux ] && missing="$missing $("$python" "$here/system_libraries.py")"
     # shellcheck disable=SC2086  # a list of package names
-    [ -z "$(echo $missing)" ] || install $missing
+    set -- $missing
+    [ $# = 0 ] || install "$@"
     ;;
 create)
     venv=$2
