@@ -102,7 +102,9 @@ class Console:
         from rich.box import SIMPLE_HEAD
         from rich.table import Table
 
-        table = Table(title=title or None, box=SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+        headed = any(columns)
+        box = SIMPLE_HEAD if headed else None
+        table = Table(title=title or None, box=box, show_header=headed, title_justify="left", title_style="bold", pad_edge=False)
         for i, column in enumerate(columns):
             table.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
         for row in rows:

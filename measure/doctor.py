@@ -1,0 +1,175 @@
+"""The self-test of a cell: its files, then, on demand, the robot and the camera. Nothing is moved.
+
+`problems` must be solved before the cell can work; `hints` are what a good cell has and this one lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from acquire.cell import Cell, devices_of, robot_model_of
+from drivers.errors import SpherecalError
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.mdh import RobotModel
+from drivers.protocols import Camera3D, Frame3D, Robot, RobotState, Safety
+
+Facts: TypeAlias = dict[str, object]
+
+AGREES_MM = 0.2
+FACTORY_CALIBRATED_MM = 20.0
+FACTORY_CALIBRATED_RAD = 0.0175
+METRES_BELOW_MM = 10.0
+FRAME_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the self-test found; `ok` of a device is None where it was not asked."""
+
+    robot: Facts
+    camera: Facts
+    problems: list[str] = field(default_factory=list)
+    hints: list[str] = field(default_factory=list)
+
+    def to_json_dict(self) -> Mapping[str, object]:
+        """What `spherecal doctor --json` prints."""
+        return {"robot": self.robot, "camera": self.camera, "problems": self.problems, "hints": self.hints}
+
+
+def examine(cell: Cell, *, offline: bool) -> Diagnosis:
+    """Examine a cell: its files always, robot and camera unless `offline`.
+
+    Raises:
+        FileError: the robot model of the cell is missing or broken.
+    """
+    model = robot_model_of(cell)
+    diagnosis = Diagnosis(
+        robot={"ok": None, "driver": cell.robot.driver, "model": cell.robot.model, "joints_rad": None, "base_from_flange": None},
+        camera={"ok": None, "driver": cell.camera.driver, "kind": cell.camera.kind},
+    )
+    diagnosis.problems.extend(cell_problems(cell, model))
+    diagnosis.hints.extend(cell_hints(cell, model))
+    try:
+        devices = devices_of(cell)
+    except SpherecalError as error:
+        diagnosis.problems.append(str(error))
+        return diagnosis
+    if not offline:
+        examine_robot(devices.robot, model, diagnosis)
+        examine_camera(devices.camera, cell, diagnosis)
+    return diagnosis
+
+
+def cell_problems(cell: Cell, model: RobotModel | None) -> list[str]:
+    """What makes a plan or a calibration impossible."""
+    problems = []
+    if not cell.spheres:
+        problems.append(f"{cell.path}, spheres: there is none. Add the certified diameter of at least one sphere.")
+    if model is not None and cell.flange_from_camera is None:
+        problems.append(f"{cell.path}, flange_from_camera: no first guess, so no poses can be planned. A drawing's figures will do.")
+    return problems
+
+
+def cell_hints(cell: Cell, model: RobotModel | None) -> list[str]:
+    """What a good cell has and this one lacks."""
+    hints = []
+    if cell.limits is None:
+        hints.append("limits: none given, so no verdict can be better than marginal")
+    if not cell.lengths:
+        hints.append("lengths: no certified length, so the scale hangs on the sphere's radius alone; one ball bar cuts the error by more than half")
+    if model is None:
+        hints.append("robot.model: none, so flange poses are taken as the robot reports them and its own errors stay")
+    without = [name for name, sphere in cell.spheres.items() if sphere.centre_in_base_mm is None]
+    if without and model is not None:
+        hints.append(f"spheres {', '.join(without)}: no centre_in_base_mm, so no poses are planned around them")
+    return hints
+
+
+def examine_robot(robot: Robot, model: RobotModel | None, diagnosis: Diagnosis) -> None:
+    """Read the robot once and compare what it says with the model."""
+    try:
+        try:
+            info = robot.open()
+            state = robot.read_state()
+        finally:
+            robot.close()
+    except SpherecalError as error:
+        diagnosis.robot["ok"] = False
+        diagnosis.problems.append(f"robot: {error}")
+        return
+    problems = robot_problems(state, model)
+    diagnosis.robot.update(
+        ok=not problems,
+        joints_rad=state.joints_rad,
+        base_from_flange=state.base_from_flange,
+        serial=info.serial,
+        controller=info.controller,
+        mode=state.mode,
+        safety=state.safety.value,
+        moving=state.moving,
+    )
+    diagnosis.problems.extend(f"robot: {problem}" for problem in problems)
+
+
+def robot_problems(state: RobotState, model: RobotModel | None) -> list[str]:
+    """What is wrong with one reading of a robot."""
+    problems = []
+    if state.safety in (Safety.PROTECTIVE_STOP, Safety.EMERGENCY_STOP):
+        problems.append(f"{state.safety.value.replace('_', ' ')} is active. Clear it at the robot.")
+    if model is None:
+        return problems if state.base_from_flange is not None else [*problems, "gives no flange pose, and the cell names no robot model"]
+    if state.joints_rad is None:
+        return [*problems, "gives no axis angles. Set model: null to work with its flange poses."]
+    if state.joints_rad.shape != (model.n_joints,):
+        return [*problems, f"gives {state.joints_rad.size} axes, the model {model.name} has {model.n_joints}. Choose the right model."]
+    if not bool(mdh.within_limits(model, state.joints_rad)):
+        problems.append(f"stands outside the axis limits of {model.name}. Wrong model, or degrees for radians?")
+    if state.base_from_flange is not None:
+        problems.extend(_pose_problems(state.base_from_flange, mdh.base_from_flange(model, state.joints_rad)))
+    return problems
+
+
+def _pose_problems(reported: se3.FloatArray, nominal: se3.FloatArray) -> list[str]:
+    off = se3.log(se3.inverse(nominal) @ reported)
+    off_mm, off_rad = float(np.linalg.norm(reported[:3, 3] - nominal[:3, 3])), float(np.linalg.norm(off[3:]))
+    if off_mm <= FACTORY_CALIBRATED_MM and off_rad <= FACTORY_CALIBRATED_RAD:
+        return []
+    causes = "wrong model, axis order or coupling, or a tool or work object that is active"
+    return [f"its flange pose is {off_mm:.1f} mm and {np.degrees(off_rad):.2f} degrees from the model's: {causes}"]
+
+
+def examine_camera(camera: Camera3D, cell: Cell, diagnosis: Diagnosis) -> None:
+    """Take one frame and look at its figures."""
+    try:
+        try:
+            info = camera.open()
+            frame = camera.capture(timeout_s=FRAME_TIMEOUT_S)
+        finally:
+            camera.close()
+    except SpherecalError as error:
+        diagnosis.camera["ok"] = False
+        diagnosis.problems.append(f"camera: {error}")
+        return
+    facts, problems = frame_facts(frame, cell.camera.working_range_mm)
+    diagnosis.camera.update(facts, ok=not problems, serial=info.serial, firmware=info.firmware)
+    diagnosis.problems.extend(f"camera: {problem}" for problem in problems)
+
+
+def frame_facts(frame: Frame3D, working_range_mm: tuple[float, float] | None) -> tuple[Facts, list[str]]:
+    """Size, valid points and depths of a frame, and what is wrong with them."""
+    height, width, _ = frame.xyz_mm.shape
+    depth_mm = frame.xyz_mm[..., 2][np.isfinite(frame.xyz_mm).all(axis=-1)]
+    facts: Facts = {"width": width, "height": height, "n_points": int(depth_mm.size), "depth_mm": None}
+    if depth_mm.size == 0:
+        return facts, []  # a camera that looks into the air is well: nothing is in its range
+    low, middle, high = (float(value) for value in np.percentile(depth_mm, (1, 50, 99)))
+    facts["depth_mm"] = [low, middle, high]
+    if middle < METRES_BELOW_MM:
+        return facts, [f"the median depth is {middle:.3f}: metres? Set the camera to mm."]
+    if working_range_mm is not None and not working_range_mm[0] / 2 <= middle <= working_range_mm[1] * 2:
+        return facts, [f"the median depth is {middle:.0f} mm, the cell's working range {working_range_mm[0]:g} to {working_range_mm[1]:g} mm."]
+    return facts, []
