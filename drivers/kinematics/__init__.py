@@ -1,0 +1,1 @@
+"""Rigid transforms, serial chains, their derivatives and their inverse."""

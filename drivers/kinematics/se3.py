@@ -135,6 +135,23 @@ def log(transform: ArrayLike) -> FloatArray:
     return np.concatenate([rho, phi], axis=-1)
 
 
+def left_jacobian(twist: ArrayLike) -> FloatArray:
+    """Left Jacobian (..., 6, 6): `exp(xi + delta) == exp(left_jacobian(xi) @ delta) @ exp(xi)` to first order.
+
+    The series sum_k ad(xi)^k / (k + 1)!, to double precision for rotations up to about half a radian.
+    """
+    xi = np.asarray(twist, dtype=np.float64)
+    ad = np.zeros((*xi.shape[:-1], 6, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = hat(xi[..., 3:])
+    ad[..., :3, 3:] = hat(xi[..., :3])
+    result = np.broadcast_to(np.eye(6), ad.shape).copy()
+    term = result.copy()
+    for k in range(2, 14):
+        term = term @ ad / k
+        result += term
+    return result
+
+
 def is_rigid(transform: ArrayLike, tolerance: float = 1e-6) -> bool:
     """Whether one (4, 4) matrix is finite, has an orthonormal right-handed rotation and the last row 0 0 0 1."""
     t = np.asarray(transform, dtype=np.float64)
