@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from acquire.cell import load_cell
+from drivers.files.shots import read_shots
+from drivers.models import parse_robot_model
 from tests.support.source import ROOT
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "THIRD_PARTY.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -35,3 +38,29 @@ def test_files_that_pages_name_exist() -> None:
     named = re.compile(r"`((?:drivers|acquire|calibrate|measure|tests|docs|tools)/[\w./-]+\.\w+)`")
     missing = {(name_of(page), path) for page in PAGES for path in named.findall(page.read_text(encoding="utf-8")) if not (ROOT / path).exists()}
     assert not missing
+
+
+def example(kind: str, containing: str) -> str:
+    """A fenced example of the page on file formats."""
+    text = (ROOT / "docs" / "file_formats.md").read_text(encoding="utf-8")
+    blocks: list[str] = re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+    return next(block for block in blocks if containing in block)
+
+
+def test_the_cell_file_of_the_page_loads(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(example("yaml", "spherecal-cell/1"), encoding="utf-8")
+    assert set(load_cell(path).spheres) == {"A", "B"}
+
+
+def test_the_robot_model_of_the_page_loads() -> None:
+    assert parse_robot_model(example("yaml", "spherecal-robot/1"), file="page").name == "two_links"
+
+
+def test_the_shot_of_the_page_loads(tmp_path: Path) -> None:
+    line = example("json", "joints_rad").replace('"..."', f'"{"0" * 64}"')
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "0000.ply").touch()
+    (tmp_path / "shots.jsonl").write_text(line, encoding="utf-8")
+    (shot,) = read_shots(tmp_path)
+    assert shot.sphere == "A"
