@@ -51,9 +51,10 @@ def parse_robot_model(text: str, *, file: str | Path) -> RobotModel:
     Raises:
         FileError: no YAML, or a key, type or value that is not allowed; with file, key path and remedy.
     """
-    from drivers.models.schema import checked
+    from drivers.files.schema import check
+    from drivers.models.schema import RobotFile
 
-    return checked(parse_yaml(text, file=file), file=str(file), text=text).model(text)
+    return check(RobotFile, parse_yaml(text, file=file), file=str(file), text=text).model(text)
 
 
 def robot_model_from_data(data: object, *, file: str | Path) -> RobotModel:
@@ -62,10 +63,10 @@ def robot_model_from_data(data: object, *, file: str | Path) -> RobotModel:
     Raises:
         FileError: a key, type or value that is not allowed.
     """
-    from drivers.models.schema import checked
+    from drivers.files.schema import check
+    from drivers.models.schema import RobotFile
 
-    content = checked(data, file=str(file))
-    return content.model(dump_yaml(data))
+    return check(RobotFile, data, file=str(file)).model(dump_yaml(data))
 
 
 def robot_model_data(model: RobotModel) -> Mapping[str, object]:
