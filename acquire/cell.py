@@ -149,8 +149,7 @@ class Cell(StrictModel):
     identity: dict[str, Scalar] = Field(default_factory=dict)
 
     _path: Path = PrivateAttr(default=Path("cell.yaml"))
-    _text: str = PrivateAttr(default="")
-    _sha256: str = PrivateAttr(default="")
+    _data: bytes = PrivateAttr(default=b"")
 
     @field_validator("work_volume_mm")
     @classmethod
@@ -179,14 +178,14 @@ class Cell(StrictModel):
         return self._path.parent
 
     @property
-    def text(self) -> str:
-        """The file's text, for verbatim copies."""
-        return self._text
+    def data(self) -> bytes:
+        """The file's bytes, for verbatim copies."""
+        return self._data
 
     @property
     def sha256(self) -> str:
         """Digest of the file's bytes."""
-        return self._sha256
+        return sha256_hex(self._data)
 
     @property
     def work_volume_box_mm(self) -> NDArray[np.float64] | None:
@@ -207,7 +206,7 @@ def load_cell(path: str | Path) -> Cell:
     if not isinstance(plain, dict):
         raise FileError("holds no keys", file=path, remedy=f"A cell file begins with `format: {CELL_FORMAT}`.")
     cell = check(Cell, plain, file=str(path), text=text)
-    cell._path, cell._text, cell._sha256 = path, text, sha256_hex(data)  # noqa: SLF001 - the file it came from is no key of it
+    cell._path, cell._data = path, data  # noqa: SLF001 - the file it came from is no key of it
     return cell
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -74,12 +74,12 @@ def read_shots(folder: Path) -> tuple[Shot, ...]:
     for number, line in enumerate(lines, start=1):
         if line.strip():
             shots.append(_shot_of_line(line, path, number, is_last=number == len(lines)))
-            _check_order(shots, path, number)
+            check_order(shots, path, number)
     return tuple(shots)
 
 
-def parse_shot(text: str, *, folder: Path, file: Path, where: str) -> Shot:
-    """One shot from its JSON text; its scans must exist in the folder.
+def parse_shot(text: str, *, folder: Path | None, file: Path, where: str) -> Shot:
+    """One shot from its JSON text; its scans must exist in the folder, where one is given.
 
     Raises:
         FileError: as `read_session`.
@@ -131,8 +131,12 @@ def _shot_of_line(line: bytes, path: Path, number: int, *, is_last: bool) -> Sho
         raise error from None
 
 
-def _check_order(shots: list[Shot], path: Path, number: int) -> None:
-    """Rising indices, `replaces` that exist, one number of axes; checked for the last shot against those before."""
+def check_order(shots: Sequence[Shot], path: Path, number: int) -> None:
+    """Check the last shot against those before: rising indices, `replaces` that exist, one number of axes.
+
+    Raises:
+        FileError: with the line number.
+    """
     shot, before = shots[-1], shots[:-1]
     record = Record({}, str(path), f"line {number}")
     if before and shot.index <= before[-1].index:
@@ -158,18 +162,18 @@ def _check_whole(shot: Shot, record: Record) -> None:
         record.fail("joints_rad", "neither axis angles nor a flange pose", 'Give "joints_rad" or "base_from_flange", or set "status" to "failed".')
 
 
-def _scan_file(record: Record, folder: Path) -> tuple[str | None, str | None]:
+def _scan_file(record: Record, folder: Path | None) -> tuple[str | None, str | None]:
     scan, sha256 = record.relative_path("scan"), record.digest("sha256")
     if scan is None:
         return None, sha256
     if sha256 is None:
         record.fail("sha256", f"the digest of {scan} is missing", "Write what `sha256sum` prints for the scan.")
-    if not (folder / scan).is_file():
+    if folder is not None and not (folder / scan).is_file():
         record.fail("scan", f"{scan} is missing", "Restore the file, or set the line's scan to null and its status to failed.")
     return scan, sha256
 
 
-def _frames(record: Record, folder: Path) -> tuple[ScanFile, ...]:
+def _frames(record: Record, folder: Path | None) -> tuple[ScanFile, ...]:
     value = record.get("frames")
     if value is None:
         return ()
