@@ -1,0 +1,74 @@
+"""What stitching and verification need of a calibration, and how a shot finds its way into the base with it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drivers.errors import DataError
+from drivers.files.session import Session, Shot
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
+
+
+class MeasuringSystem(Protocol):
+    """A calibrated robot with a camera; `calibrate.Calibration` is one."""
+
+    @property
+    def id(self) -> str:
+        """Digest that results carry."""
+        ...
+
+    @property
+    def model(self) -> RobotModel | None:
+        """Nominal robot; None for a pose-only calibration."""
+        ...
+
+    def points_in_base_mm(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        """Calibrated points (n, 3)."""
+        ...
+
+
+def points_of_shot_in_base_mm(calibration: MeasuringSystem, session: Session, shot: Shot, points_in_camera_mm: ArrayLike) -> FloatArray:
+    """Calibrated points (n, 3) of a shot in the base.
+
+    Raises:
+        DataError: the shot lacks the joints, or the flange pose, that this calibration needs.
+    """
+    if calibration.model is not None:
+        if shot.joints_rad is None:
+            raise _lacking(session, shot, "no joints, which this calibration of the whole robot needs", "Capture with joints")
+        return calibration.points_in_base_mm(points_in_camera_mm, joints_rad=shot.joints_rad)
+    if shot.base_from_flange is None:
+        raise _lacking(session, shot, "no flange pose, which this pose-only calibration needs", "Record base_from_flange")
+    return calibration.points_in_base_mm(points_in_camera_mm, base_from_flange=shot.base_from_flange)
+
+
+def nominal_base_from_camera(
+    model: RobotModel | None, first_guess: ArrayLike | None, joints_rad: FloatArray | None, base_from_flange: FloatArray | None
+) -> FloatArray | None:
+    """Where the uncalibrated cell puts the camera (4, 4): nominal robot and first guess; None where there is no guess."""
+    if first_guess is None:
+        return None
+    if model is not None and joints_rad is not None:
+        return np.asarray(mdh.base_from_flange(model, joints_rad) @ np.asarray(first_guess))
+    return None if base_from_flange is None else np.asarray(base_from_flange @ np.asarray(first_guess))
+
+
+def nominal_points_in_base_mm(base_from_camera: FloatArray, points_in_camera_mm: ArrayLike) -> FloatArray:
+    """Points (n, 3) as the uncalibrated cell sees them."""
+    return se3.apply(base_from_camera, np.asarray(points_in_camera_mm, dtype=np.float64))
+
+
+def _lacking(session: Session, shot: Shot, what: str, remedy: str) -> DataError:
+    return DataError(
+        f"the shot has {what}",
+        file=session.folder / "shots.jsonl",
+        where=f"shot {shot.index}",
+        remedy=f"{remedy}, or use a calibration made from sessions like this one.",
+    )
