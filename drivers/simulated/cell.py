@@ -205,6 +205,9 @@ def _mesh_data(truth: Truth, folder: Path) -> tuple[FloatArray, NDArray[np.int32
     path = mesh_path(truth.workpiece, folder)
     try:
         mesh = trimesh.load_mesh(path)
-        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
-    except (OSError, ValueError, AttributeError) as error:
+        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
+    except (OSError, ValueError, AttributeError, NotImplementedError) as error:
         raise FileError(f"cannot be read as a mesh ({error})", file=path, remedy="Name a mesh file in mm, or `stepped_block`.") from error
+    if len(faces) == 0:
+        raise FileError("holds no mesh", file=path, remedy="Name a mesh file in mm, or `stepped_block`.")
+    return vertices, faces
