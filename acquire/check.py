@@ -37,7 +37,7 @@ def check_session(session: Session, cell: Cell, model: RobotModel | None) -> Non
 
 
 def _fail(session: Session, shot: Shot, key: str, message: str, remedy: str) -> FileError:
-    return FileError(message, file=session.folder / "shots.jsonl", where=f"shot {shot.index}, {key}", remedy=remedy)
+    return FileError(message, file=session.folder / "shots.jsonl", where=f"line {shot.line}, {key} of shot {shot.index}", remedy=remedy)
 
 
 def _check_sphere(session: Session, shot: Shot, cell: Cell) -> None:

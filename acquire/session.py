@@ -13,6 +13,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
 from pathlib import Path
@@ -243,8 +244,8 @@ class SessionWriter:
     def _commit(self, values: Mapping[str, object], scans: Sequence[tuple[str, bytes]]) -> Shot:
         path = self.folder / "shots.jsonl"
         line = json.dumps(values)
-        number = len(self._shots) + 1
-        shot = parse_shot(line, folder=None, file=path, where=f"line {number}")
+        number = self._shots[-1].line + 1 if self._shots else 1
+        shot = replace(parse_shot(line, folder=None, file=path, where=f"line {number}"), line=number)
         check_order([*self._shots, shot], path, number)
         for name, data in scans:
             write_atomic(self.folder / name, data)

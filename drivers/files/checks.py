@@ -148,7 +148,7 @@ def as_mapping(value: object, *, file: str | Path, where: str) -> Mapping[str, o
         FileError: for anything else.
     """
     if not isinstance(value, dict):
-        raise FileError(f"{_shown(value)} stands where `key: value` lines belong", file=file, where=where, remedy="See docs/file-formats.md.")
+        raise FileError(f"{_shown(value)} stands where `key: value` lines belong", file=file, where=where, remedy="See docs/file_formats.md.")
     if odd := [key for key in value if not isinstance(key, str)]:
         raise FileError(f"the key {odd[0]!r} is no text", file=file, where=where, remedy=f'Put it in quotes: "{odd[0]}".')
     return value
@@ -161,13 +161,16 @@ def parse_json_object(text: str, *, file: str | Path, where: str) -> Mapping[str
         FileError: for anything else.
     """
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
+        value = json.loads(text, object_pairs_hook=_unique)
+        place = _not_finite(value, "")
     except json.JSONDecodeError as error:
         raise FileError(f"broken JSON ({error.msg} at character {error.pos + 1})", file=file, where=where, remedy=_JSON_REMEDY) from error
     except (ValueError, RecursionError) as error:
         raise FileError(f"broken JSON ({error})", file=file, where=where, remedy=_JSON_REMEDY) from error
     if not isinstance(value, dict):
         raise FileError("is no JSON object", file=file, where=where, remedy=_JSON_REMEDY)
+    if place is not None:
+        raise FileError(f"{place}: NaN or infinite", file=file, where=where, remedy='Write null, or set the "status" of the shot to "failed".')
     return value
 
 
@@ -183,9 +186,16 @@ def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return result
 
 
-def _refuse_constant(text: str) -> NoReturn:
-    msg = f"{text} is no number in JSON; write null"
-    raise ValueError(msg)
+def _not_finite(value: object, path: str) -> str | None:
+    """The key path of the first number that is NaN or infinite."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else path
+    items: list[tuple[str, object]] = []
+    if isinstance(value, dict):
+        items = [(f"{path}.{key}" if path else str(key), item) for key, item in value.items()]
+    elif isinstance(value, list):
+        items = [(f"{path}[{i}]", item) for i, item in enumerate(value)]
+    return next((found for key, item in items if (found := _not_finite(item, key))), None)
 
 
 def _why_not_rigid(matrix: FloatArray) -> str:

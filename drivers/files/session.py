@@ -110,7 +110,7 @@ def read_scan(session: Session, shot: Shot) -> PointCloud:
         FileError: the shot has no scan, or its file is missing, cut off, broken or changed since the capture.
     """
     if shot.scan is None or shot.sha256 is None:
-        raise FileError("the shot has no scan", file=session.folder / "shots.jsonl", where=f"shot {shot.index}", remedy="Leave this shot out.")
+        raise FileError("the shot has no scan", file=session.folder / "shots.jsonl", where=f"line {shot.line}", remedy="Leave this shot out.")
     path = session.folder / shot.scan
     with_place = f"shot {shot.index}"
     try:

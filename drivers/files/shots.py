@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from drivers.errors import FileError
@@ -55,6 +55,8 @@ class Shot:
     """(3,)"""
     extra: Mapping[str, object] = field(default_factory=dict)
     """Keys of the line that spherecal does not know."""
+    line: int = 0
+    """The line of shots.jsonl that this shot stands in, from 1; 0 for a shot that is not on disk."""
 
     @property
     def is_reference_point(self) -> bool:
@@ -117,7 +119,8 @@ def parse_shot(text: str, *, folder: Path | None, file: Path, where: str) -> Sho
 
 def _shot_of_line(line: bytes, path: Path, number: int, *, is_last: bool) -> Shot:
     try:
-        return parse_shot(decode_text(line, file=path), folder=path.parent, file=path, where=f"line {number}")
+        shot = parse_shot(decode_text(line, file=path), folder=path.parent, file=path, where=f"line {number}")
+        return replace(shot, line=number)
     except FileError as error:
         if is_last and "JSON" in error.message:
             error = FileError(
