@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from acquire.cell import Limits
 from drivers.errors import DataError
 from drivers.files.session import Session, Shot
 from drivers.kinematics import mdh, se3
@@ -31,6 +33,40 @@ class MeasuringSystem(Protocol):
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
     ) -> FloatArray:
         """Calibrated points (n, 3)."""
+        ...
+
+
+class TrainingShot(Protocol):
+    """One shot that a calibration was made from."""
+
+    @property
+    def scan_sha256(self) -> str:
+        """Digest of its scan."""
+        ...
+
+
+class JudgedSystem(MeasuringSystem, Protocol):
+    """What verification needs besides."""
+
+    @property
+    def radius_offset_mm(self) -> float:
+        """By how much spheres read larger in radius."""
+        ...
+
+    @property
+    def limits(self) -> Limits | None:
+        """Limits of the cell it was made in."""
+        ...
+
+    @property
+    def shots(self) -> Sequence[TrainingShot]:
+        """The shots it was made from."""
+        ...
+
+    def point_covariance_in_base_mm2(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        """Covariance (n, 3, 3) of calibrated points."""
         ...
 
 

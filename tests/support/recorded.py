@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from acquire.cell import Cell, load_cell
+from acquire.cell import Cell, Limits, load_cell
 from acquire.session import SessionWriter
 from drivers.files.session import Session, read_session
 from drivers.files.yaml import dump_yaml
@@ -23,12 +23,23 @@ LIMITS = {"centre_rms_mm": 0.2, "length_error_mm": 0.2, "diameter_error_mm": 0.1
 
 
 @dataclass(frozen=True)
+class TrainedOn:
+    """A shot that a system was made from."""
+
+    scan_sha256: str
+
+
+@dataclass(frozen=True)
 class TrueSystem:
     """A measuring system that knows the synthetic cell's truth."""
 
     cell: SyntheticCell
     pose_only: bool = False
     id: str = "0" * 64
+    radius_offset_mm: float = 0.0
+    limits: Limits | None = None
+    shots: tuple[TrainedOn, ...] = ()
+    sigma_mm: float = 0.02
 
     @property
     def model(self) -> RobotModel | None:
@@ -42,6 +53,11 @@ class TrueSystem:
         points[:, 2] -= self.cell.camera_error_mm(points)
         flange = mdh.base_from_flange(self.cell.true, joints_rad) if joints_rad is not None else np.asarray(base_from_flange)
         return se3.apply(flange @ self.cell.flange_from_camera, points)
+
+    def point_covariance_in_base_mm2(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        return np.tile(np.eye(3) * self.sigma_mm**2, (len(np.asarray(points_in_camera_mm)), 1, 1))
 
 
 def write_cell(folder: Path, places: dict[str, tuple[float, float, float]] = PLACES, *, limits: bool = True, kind: str = "area") -> Cell:
