@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from measure.cli_cell import doctor, new_cell
+from measure.cli_plan import plan
 from measure.cli_run import run_app
 from measure.console import Console
 
@@ -28,6 +29,7 @@ new.command("cell")(new_cell)
 
 app.add_typer(new, name="new")
 app.command("doctor")(doctor)
+app.command("plan")(plan)
 
 
 @app.callback(invoke_without_command=True)

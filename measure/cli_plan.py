@@ -1,0 +1,69 @@
+"""`spherecal plan`: poses that the robot can reach and from which the camera sees what it should."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from measure.cli_run import AsJson, Debug, Quiet, command
+
+if TYPE_CHECKING:
+    from measure.console import Console
+    from measure.planning import PlanResult, Purpose
+
+
+class For(StrEnum):
+    """What a plan is for."""
+
+    calibrate = "calibrate"
+    verify = "verify"
+    workpiece = "workpiece"
+
+
+_PURPOSES: dict[For, Purpose] = {For.calibrate: "calibration", For.verify: "verification", For.workpiece: "workpiece"}
+
+
+def plan(
+    cell: Annotated[Path, typer.Argument(help="The cell file.")],
+    n: Annotated[int, typer.Option("-n", min=1, help="Poses wanted, shared among the spheres.")] = 40,
+    purpose: Annotated[For, typer.Option("--for", help="What the poses are for.")] = For.calibrate,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The plan to write.")] = Path("plan.yaml"),
+    sphere: Annotated[list[str] | None, typer.Option("--sphere", help="Look at this sphere. Repeat; all if left out.")] = None,
+    region: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box in the base, mm, for --for workpiece; the work volume if left out."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Plan feasible, well-spread poses and write them as a plan that may be edited."""
+    with command(as_json, debug, quiet) as run:
+        import numpy as np
+
+        from acquire.cell import load_cell
+        from acquire.plan import PLAN_FORMAT, write_plan
+        from measure.files import replacing
+        from measure.planning import PlanSettings, make_plan
+
+        box = None if region is None else np.array(region).reshape(2, 3)
+        loaded = load_cell(cell)
+        result = make_plan(loaded, PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed))
+        with replacing(out, PLAN_FORMAT) as former:
+            write_plan(result.plan, out)
+        if former is not None and former.exists():
+            run.console.note(f"the earlier {out} was kept as {former}")
+        if loaded.obstacles:
+            run.console.note("note: obstacles of the cell are not checked yet; watch the first run in --step mode")
+        _tell(run.console, result, out)
+        run.finish({**result.to_json_dict(), "out": out})
+
+
+def _tell(console: Console, result: PlanResult, out: Path) -> None:
+    rows = [[f"rejected: {reason}", count] for reason, count in sorted(result.rejected.items())]
+    console.table("", ["candidates", "views"], [["drawn", result.n_candidates], *rows, ["feasible", result.n_feasible]])
+    console.say(f"{len(result.plan.poses)} poses in {out}")

@@ -1,0 +1,165 @@
+"""From a cell to a plan: feasible views of each sphere or of a region, a well-spread choice, an order with little travel."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from acquire.cell import Cell, robot_model_of
+from acquire.ordering import choose_spread, order_by_travel
+from acquire.plan import Plan, PlannedPose
+from acquire.poses import DEFAULT_LAW, CandidatePool, sphere_candidates, workpiece_poses
+from acquire.visibility import CameraView, camera_view
+from drivers.errors import DataError, SettingsError
+from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
+
+Purpose: TypeAlias = Literal["calibration", "verification", "workpiece"]
+
+CANDIDATES_PER_POSE = 12
+FEWEST_CANDIDATES = 200
+
+# Plans for different purposes are drawn from different streams: a verification that repeats the poses of the
+# calibration would prove nothing.
+_STREAM: Mapping[Purpose, int] = {"calibration": 1, "verification": 2, "workpiece": 3}
+
+
+@dataclass(frozen=True, slots=True)
+class PlanSettings:
+    """What is to be planned."""
+
+    purpose: Purpose = "calibration"
+    n_poses: int = 40
+    spheres: tuple[str, ...] = ()
+    """All spheres of known place if empty."""
+    region_mm: FloatArray | None = None
+    """(2, 3) box in the base that workpiece poses cover; the cell's work volume if None."""
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanResult:
+    """A plan, and what became of the candidates."""
+
+    plan: Plan
+    n_candidates: int
+    n_feasible: int
+    rejected: Mapping[str, int] = field(default_factory=dict)
+
+    def to_json_dict(self) -> Mapping[str, object]:
+        """What `spherecal plan --json` prints; nothing is predicted here, so the predictions are null."""
+        return {
+            "n_candidates": self.n_candidates,
+            "n_feasible": self.n_feasible,
+            "rejected": self.rejected,
+            "poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in self.plan.poses],
+            "predicted": {"centre_rms_mm": None, "length_rms_mm": None} | dict(self.plan.predicted),
+        }
+
+
+def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
+    """Plan the poses of a run.
+
+    Raises:
+        SettingsError: the cell lacks what planning needs (robot model, hand-eye guess, camera view, places of spheres).
+        DataError: too few poses are feasible.
+        FileError: the robot model is missing or broken.
+    """
+    model, flange_from_camera = _needed(cell)
+    rng = np.random.default_rng([settings.seed, _STREAM[settings.purpose]])
+    view = camera_view(cell.camera)
+    pools: list[tuple[str | None, CandidatePool]] = []
+    if settings.purpose == "workpiece":
+        pools.append((None, _workpiece_pool(cell, settings, model, flange_from_camera, view, rng)))
+    else:
+        spheres = _spheres(cell, settings.spheres)
+        for name, n in zip(spheres, _shared_out(settings.n_poses, len(spheres)), strict=True):
+            pools.append((name, _sphere_pool(cell, name, n, model, flange_from_camera, view, rng)))
+    return _result(cell, settings.purpose, pools)
+
+
+def _result(cell: Cell, purpose: Purpose, pools: Sequence[tuple[str | None, CandidatePool]]) -> PlanResult:
+    names = [name for name, pool in pools for _ in pool.view]
+    joints = np.concatenate([pool.joints_rad for _, pool in pools])
+    order = order_by_travel(joints)
+    poses = tuple(PlannedPose(f"{i:03d}", names[row], joints[row].round(6)) for i, row in enumerate(order, start=1))
+    rejected: Counter[str] = Counter()
+    for _, pool in pools:
+        rejected.update(pool.rejected)
+    n_candidates = sum(pool.n_candidates for _, pool in pools)
+    plan = Plan(cell.sha256, purpose, poses)
+    return PlanResult(plan, n_candidates, n_candidates - rejected.total(), dict(rejected))
+
+
+def _needed(cell: Cell) -> tuple[RobotModel, FloatArray]:
+    model = robot_model_of(cell)
+    if model is None:
+        raise SettingsError("poses cannot be planned without a robot model", file=cell.path, where="robot.model", remedy="Name a model.")
+    if cell.flange_from_camera is None:
+        remedy = "Give a first guess, from a drawing: a few mm and degrees are near enough."
+        raise SettingsError("poses cannot be planned without a hand-eye guess", file=cell.path, where="flange_from_camera", remedy=remedy)
+    return model, np.asarray(cell.flange_from_camera, dtype=np.float64)
+
+
+def _spheres(cell: Cell, wanted: Sequence[str]) -> tuple[str, ...]:
+    if unknown := [name for name in wanted if name not in cell.spheres]:
+        known = ", ".join(cell.spheres) or "none"
+        raise SettingsError(f"there is no sphere {unknown[0]!r}", file=cell.path, where="spheres", remedy=f"Spheres of the cell: {known}.")
+    placed = tuple(name for name in wanted or cell.spheres if cell.spheres[name].centre_in_base_mm is not None)
+    missing = [name for name in wanted if name not in placed]
+    if missing or not placed:
+        where = f"spheres.{missing[0]}" if missing else "spheres"
+        remedy = "Add centre_in_base_mm: [x, y, z], known to a few mm."
+        raise SettingsError("no poses can be planned around a sphere of unknown place", file=cell.path, where=where, remedy=remedy)
+    return placed
+
+
+def _shared_out(n: int, among: int) -> list[int]:
+    if n < among:
+        raise SettingsError(f"{n} poses are fewer than {among} spheres", where="-n", remedy="Ask for more poses, or name fewer spheres.")
+    return [n // among + (i < n % among) for i in range(among)]
+
+
+def _sphere_pool(
+    cell: Cell, name: str, n: int, model: RobotModel, flange_from_camera: FloatArray, view: CameraView, rng: np.random.Generator
+) -> CandidatePool:
+    sphere = cell.spheres[name]
+    others = [(o.centre_in_base_mm, o.radius_mm) for key, o in cell.spheres.items() if key != name and o.centre_in_base_mm is not None]
+    pool = sphere_candidates(
+        model,
+        flange_from_camera,
+        np.asarray(sphere.centre_in_base_mm, dtype=np.float64),
+        sphere.radius_mm,
+        view,
+        max(FEWEST_CANDIDATES, CANDIDATES_PER_POSE * n),
+        rng,
+        other_spheres=[(np.asarray(centre), radius) for centre, radius in others],
+    )
+    if pool.n_feasible < n:
+        reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
+        raise DataError(
+            f"only {pool.n_feasible} of {pool.n_candidates} views of sphere {name} are feasible ({reasons}), {n} are wanted",
+            file=cell.path,
+            where=f"spheres.{name}",
+            remedy="Move the sphere to the middle of the robot's reach, or ask for fewer poses.",
+        )
+    return pool.take(choose_spread(pool, n, rng))
+
+
+def _workpiece_pool(
+    cell: Cell, settings: PlanSettings, model: RobotModel, flange_from_camera: FloatArray, view: CameraView, rng: np.random.Generator
+) -> CandidatePool:
+    region = settings.region_mm if settings.region_mm is not None else cell.work_volume_box_mm
+    if region is None:
+        remedy = "Give --region X0 Y0 Z0 X1 Y1 Z1, or work_volume_mm in the cell file."
+        raise SettingsError("no region to cover is known", file=cell.path, where="work_volume_mm", remedy=remedy)
+    pool = workpiece_poses(model, flange_from_camera, view, region, settings.n_poses, rng, law=replace(DEFAULT_LAW, largest_tilt_rad=0.6))
+    if len(pool.view) == 0:
+        reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
+        remedy = "Name a region within the robot's reach."
+        raise DataError(f"no view of the region is feasible ({reasons})", file=cell.path, where="region", remedy=remedy)
+    return pool
