@@ -22,7 +22,8 @@ def share_at_middle(points: FloatArray, centre: FloatArray, radius_mm: float, on
         if beside(points[i], centre) < 0.8 * radius_mm:
             middle += 1
             hits += on_it[i]
-    return hits / max(middle, 1)
+    # nothing seen there (a highlight, say) speaks neither for nor against
+    return hits / middle if middle > 0 else 1.0
 
 
 @compiled

@@ -251,5 +251,5 @@ def supports(
                 if beside(points[i], c) < 0.8 * radius_mm:
                     middle += 1
                     hits += on
-        shares[k] = hits / max(middle, 1)
+        shares[k] = hits / middle if middle > 0 else 1.0
     return counts, shares

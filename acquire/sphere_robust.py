@@ -81,7 +81,7 @@ def _robust_fit(points: FloatArray, start: FloatArray, radius_mm: float, setting
     for _ in range(_WIDE_STEPS):
         selected = _within_shell(few, centre, radius_mm, gate, settings, facing)
         centre = _step(few, selected, centre, radius_mm)
-    _check_curved(few, selected, centre, radius_mm, facing)
+    _check_curved(few, selected, centre, radius_mm, settings, facing)
     fit = _narrow(few, _Fit(centre, selected, gate), radius_mm, settings, facing)
     if len(few) == len(points):
         return fit
@@ -103,7 +103,9 @@ def _narrow(points: FloatArray, fit: _Fit, radius_mm: float, settings: SphereSet
     return _Fit(centre=centre, selected=selected, noise_mm=noise)
 
 
-def _check_curved(points: FloatArray, selected: IntArray, centre: FloatArray, radius_mm: float, facing: float) -> None:
+def _check_curved(
+    points: FloatArray, selected: IntArray, centre: FloatArray, radius_mm: float, settings: SphereSettings, facing: float
+) -> None:
     """Refuse early what a sphere of another size or a plane leaves: a residual that grows with the square of the place.
 
     Over a cap of radius r the residual from radius R is `(R - R²/r) (a² + b²) / 2`, (a, b) the normal's lateral parts.
@@ -118,7 +120,7 @@ def _check_curved(points: FloatArray, selected: IntArray, centre: FloatArray, ra
     if curvature < 0.15 * radius_mm:
         raise SphereNotFound("no_sphere", f"the surface nearest to a sphere of radius {radius_mm:.3f} mm is flat or nearly so", remedy=LOOK_REMEDY)
     # curved, but less: the gate on the free radius says by how much
-    _checked_radius(points[selected], centre, radius_mm, SphereSettings(max_radius_error_share=0.4))
+    _checked_radius(points[selected], centre, radius_mm, settings)
 
 
 def _within_shell(
