@@ -41,7 +41,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# One BLAS thread a process: two processes share two cores, and threads on small matrices were measured 4 times slower.
+# One BLAS thread a process: two processes share two cores, and on matrices this small more threads gain nothing and were seen to stall.
 test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS)
 
