@@ -199,8 +199,15 @@ def load_cell(path: str | Path) -> Cell:
     Raises:
         FileError: with key path and line, what was found and what is allowed.
     """
-    path = Path(path)
-    data = read_bytes(path)
+    return parse_cell(read_bytes(path), path=Path(path))
+
+
+def parse_cell(data: bytes, *, path: Path) -> Cell:
+    """The cell in the bytes of a cell file; relative paths in it start from the folder of `path`.
+
+    Raises:
+        FileError: as `load_cell`.
+    """
     text = decode_text(data, file=path)
     plain = parse_yaml(text, file=path)
     if not isinstance(plain, dict):

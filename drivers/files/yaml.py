@@ -56,7 +56,8 @@ def line_of(text: str, key_path: Sequence[str | int], *, file: str | Path) -> in
     """The line (from 1) of the value at a key path, or of the deepest part of the path that exists."""
     construction = _Construction(text, file)
     construction.document()
-    paths = (tuple(key_path[:n]) for n in range(len(key_path), 0, -1))
+    names = tuple(map(str, key_path))
+    paths = (names[:n] for n in range(len(names), 0, -1))
     return next((construction.lines[path] for path in paths if path in construction.lines), None)
 
 
@@ -83,7 +84,7 @@ class _Construction:
         self._file = file
         self._anchors: dict[str, object] = {}
         self._n_values = 0
-        self.lines: dict[tuple[str | int, ...], int] = {}
+        self.lines: dict[tuple[str, ...], int] = {}
         """Line (from 1) of the value at every key path."""
 
     def document(self) -> object:
@@ -105,7 +106,7 @@ class _Construction:
             raise self._error(following, "a second document begins", "Keep one document only: remove the line `---`.")
         return value
 
-    def _value(self, events: Iterator[Any], event: Any, path: tuple[str | int, ...]) -> object:
+    def _value(self, events: Iterator[Any], event: Any, path: tuple[str, ...]) -> object:
         self._count(event, len(path))
         self.lines[path] = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
@@ -122,13 +123,13 @@ class _Construction:
             self._anchors[event.anchor] = value
         return value
 
-    def _list(self, events: Iterator[Any], path: tuple[str | int, ...]) -> list[object]:
+    def _list(self, events: Iterator[Any], path: tuple[str, ...]) -> list[object]:
         result: list[object] = []
         while not isinstance(event := next(events), yaml.SequenceEndEvent):
-            result.append(self._value(events, event, (*path, len(result))))
+            result.append(self._value(events, event, (*path, str(len(result)))))
         return result
 
-    def _mapping(self, events: Iterator[Any], path: tuple[str | int, ...]) -> dict[Hashable, object]:
+    def _mapping(self, events: Iterator[Any], path: tuple[str, ...]) -> dict[Hashable, object]:
         result: dict[Hashable, object] = {}
         while not isinstance(event := next(events), yaml.MappingEndEvent):
             key = self._value(events, event, (*path, "?"))
