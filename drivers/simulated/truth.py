@@ -4,7 +4,7 @@ Tuples of floats throughout, so that a truth compares as what it is and goes to 
 has a default that means "no such effect": `RobotTruth()` is the nominal robot.
 
 Not modelled: link and gearbox elasticity beyond gravity, linkage lengths of a parallelogram, temperature as such
-(only its drift), vibration after a stop, blur of a moving camera, inter-reflection, the pattern's specular highlights.
+(only its drift), vibration after a stop, blur of a moving camera, the projector's shadow, inter-reflection, the pattern's specular highlights.
 """
 
 from __future__ import annotations
