@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from drivers.models import load_robot_model, parse_robot_model, robot_model_data, robot_model_from_data, shipped_models
+from tests.support.robotstudio import pairs
 
-FIXTURE = Path(__file__).parents[3] / "fixtures" / "robots" / "irb1410_robotstudio_pairs.csv"
 MISPRINTED_PAIR = 7
 
 GOOD: dict[str, Any] = {
@@ -29,14 +28,6 @@ GOOD: dict[str, Any] = {
     "linear_limits_rad": [{"row": [1, -1], "min": -1, "max": 1}],
     "shape": [{"link": 1, "start_mm": [0, 0, 0], "end_mm": [0, 0, 100], "radius_mm": 50}],
 }
-
-
-def pairs() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Axis angles (n, 6) in rad, flange positions (n, 3) in mm and quaternions (n, 4), w first."""
-    with FIXTURE.open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(line for line in stream if not line.startswith("#")))
-    table = np.array([[float(value) for value in row.values()] for row in rows])
-    return np.deg2rad(table[:, 1:7]), table[:, 7:10], table[:, 10:]
 
 
 def standard_dh(q: FloatArray, d: list[float], a: list[float], alpha: list[float]) -> FloatArray:
