@@ -84,16 +84,24 @@ def load_plan(path: str | Path, cell: Cell | None = None, model: RobotModel | No
     Raises:
         FileError: with key path and line; for what the file says, an unknown sphere, or a pose outside the limits.
     """
-    text = read_text(path)
-    file = check(_PlanFile, parse_yaml(text, file=path), file=str(path), text=text)
-    poses = tuple(_pose(item) for item in file.poses)
+    return parse_plan(read_text(path), file=path, cell=cell, model=model)
+
+
+def parse_plan(text: str, *, file: str | Path, cell: Cell | None = None, model: RobotModel | None = None) -> Plan:
+    """The plan in a YAML text, checked as `load_plan` does; `file` is named in errors.
+
+    Raises:
+        FileError: as `load_plan`.
+    """
+    path, content = file, check(_PlanFile, parse_yaml(text, file=file), file=str(file), text=text)
+    poses = tuple(_pose(item) for item in content.poses)
     _check_unique(poses, path)
     for i, pose in enumerate(poses):
         _check_sphere(pose, cell, path, i)
         _check_joints(pose, poses[0], model, path, i)
-    if cell is not None and cell.sha256 != file.cell_sha256:
+    if cell is not None and cell.sha256 != content.cell_sha256:
         _LOG.warning("%s was made for another state of %s; spheres and limits were checked again.", path, cell.path)
-    return Plan(file.cell_sha256, file.purpose, poses, file.predicted)
+    return Plan(content.cell_sha256, content.purpose, poses, content.predicted)
 
 
 def plan_text(plan: Plan) -> str:
