@@ -64,4 +64,5 @@ def overall(judgements: Sequence[Judgement], gaps: Sequence[str]) -> tuple[Verdi
         return "reject", (*reasons, *gaps)
     if reasons or gaps or not judgements:
         return "not_proven", (*reasons, *gaps)
-    return "conform", tuple(j.reason for j in judgements)
+    tightest = max(judgements, key=lambda j: abs(j.value_mm) / j.limit_mm)
+    return "conform", (f"all {len(judgements)} judged figures keep their limits; the tightest is {tightest.reason}",)
