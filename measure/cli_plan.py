@@ -51,14 +51,11 @@ def plan(
         from measure.planning import PlanSettings, make_plan
 
         box = None if region is None else np.array(region).reshape(2, 3)
-        loaded = load_cell(cell)
-        result = make_plan(loaded, PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed))
+        result = make_plan(load_cell(cell), PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed))
         with replacing(out, PLAN_FORMAT) as former:
             write_plan(result.plan, out)
         if former is not None and former.exists():
             run.console.note(f"the earlier {out} was kept as {former}")
-        if loaded.obstacles:
-            run.console.note("note: obstacles of the cell are not checked yet; watch the first run in --step mode")
         _tell(run.console, result, out)
         run.finish({**result.to_json_dict(), "out": out})
 

@@ -45,14 +45,19 @@ def true_centres_in_base_mm() -> dict[str, FloatArray]:
     return centres | {name: np.array(centre) for name, centre in _PLATE.items()}
 
 
-def write_demo_cell(folder: Path, seed: int) -> Path:
+def write_demo_cell(folder: Path, seed: int, resolution_px: tuple[int, int] = RESOLUTION_PX) -> Path:
     """Write truth.yaml and cell.yaml into a folder; returns the path of the cell file.
+
+    Args:
+        folder: where they go.
+        seed: draws the noise, the hand-eye error and the certificates.
+        resolution_px: width and height of the camera.
 
     Raises:
         FileError: the folder cannot be written.
     """
     rng = np.random.default_rng([seed, 500])
-    _write_truth(folder / "truth.yaml", seed)
+    _write_truth(folder / "truth.yaml", seed, resolution_px)
     path = folder / "cell.yaml"
     write_text_atomic(path, dump_yaml(_cell_data(rng)))
     return path
@@ -87,6 +92,7 @@ def _cell_data(rng: np.random.Generator) -> dict[str, object]:
         "lengths": _lengths(centres, rng),
         "limits": {"centre_rms_mm": 0.2, "length_error_mm": 0.2, "diameter_error_mm": 0.1, "form_mm": 0.3},
         "work_volume_mm": [[650, -300, 100], [1150, 300, 600]],
+        "obstacles": [{"name": "table", "kind": "box", "centre_in_base_mm": [900, 0, TABLE_TOP_MM - 20], "size_mm": [1200, 1600, 40]}],
         "motion": {"speed_rad_s": 0.5, "settle_s": 0.5, "frames": 1},
         "identity": {"robot_serial": "simulated", "camera_serial": "simulated"},
     }
@@ -105,7 +111,7 @@ def _lengths(centres: dict[str, FloatArray], rng: np.random.Generator) -> list[d
     ]
 
 
-def _write_truth(path: Path, seed: int) -> None:
+def _write_truth(path: Path, seed: int, resolution_px: tuple[int, int]) -> None:
     from drivers.kinematics import se3
     from drivers.models import load_robot_model
     from drivers.simulated.draws import paper_truth, post, table, transform_rows
@@ -123,6 +129,6 @@ def _write_truth(path: Path, seed: int) -> None:
         spheres=spheres,
         boxes=(table(TABLE_TOP_MM), *(post(sphere, TABLE_TOP_MM) for sphere in spheres.values())),
         workpiece=WorkpieceTruth(transform_rows(se3.from_rotation_translation(turned, WORKPIECE_CENTRE_MM))),
-        resolution_px=RESOLUTION_PX,
+        resolution_px=resolution_px,
     )
     write_truth(truth, path)

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from acquire.cell import Cell, robot_model_of
+from acquire.collision import cell_collisions
 from acquire.ordering import choose_spread, order_by_travel
 from acquire.plan import Plan, PlannedPose
 from acquire.poses import DEFAULT_LAW, CandidatePool, sphere_candidates, workpiece_poses
@@ -138,6 +139,7 @@ def _sphere_pool(
         max(FEWEST_CANDIDATES, CANDIDATES_PER_POSE * n),
         rng,
         other_spheres=[(np.asarray(centre), radius) for centre, radius in others],
+        blocked=cell_collisions(cell, model),
     )
     if pool.n_feasible < n:
         reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
@@ -157,7 +159,8 @@ def _workpiece_pool(
     if region is None:
         remedy = "Give --region X0 Y0 Z0 X1 Y1 Z1, or work_volume_mm in the cell file."
         raise SettingsError("no region to cover is known", file=cell.path, where="work_volume_mm", remedy=remedy)
-    pool = workpiece_poses(model, flange_from_camera, view, region, settings.n_poses, rng, law=replace(DEFAULT_LAW, largest_tilt_rad=0.6))
+    law, blocked = replace(DEFAULT_LAW, largest_tilt_rad=0.6), cell_collisions(cell, model)
+    pool = workpiece_poses(model, flange_from_camera, view, region, settings.n_poses, rng, law=law, blocked=blocked)
     if len(pool.view) == 0:
         reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
         remedy = "Name a region within the robot's reach."

@@ -95,7 +95,7 @@ def test_what_cannot_be_planned_is_told_and_leaves_nothing(
     [
         ("model: irb1410_paper", "model: null", "robot model"),
         ("working_range_mm: [250, 450]", "working_range_mm: null", "working_range_mm"),
-        ("centre_in_base_mm", "cte_per_k: 1.0e-6 #", "unknown place"),
+        ("\n    centre_in_base_mm", "\n    cte_per_k: 1.0e-6 #", "unknown place"),
     ],
 )
 def test_a_cell_that_lacks_something_is_told_what(old: str, new: str, words: str, cell_path: Path, tmp_path: Path) -> None:
