@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from acquire.cell import Limits
+from calibrate.observations import SphereShot
 from drivers.errors import DataError
 from drivers.files.session import Session, Shot
 from drivers.kinematics import mdh, se3
@@ -63,10 +64,15 @@ class JudgedSystem(MeasuringSystem, Protocol):
         """The shots it was made from."""
         ...
 
-    def point_covariance_in_base_mm2(
+    @property
+    def covariance(self) -> FloatArray:
+        """(P, P): the p parameters of `point_jacobian` first, then the radius offset, then others."""
+        ...
+
+    def point_jacobian(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
     ) -> FloatArray:
-        """Covariance (n, 3, 3) of calibrated points."""
+        """(n, 3, p) motion of calibrated points per parameter."""
         ...
 
 
@@ -83,6 +89,22 @@ def points_of_shot_in_base_mm(calibration: MeasuringSystem, session: Session, sh
     if shot.base_from_flange is None:
         raise _lacking(session, shot, "no flange pose, which this pose-only calibration needs", "Record base_from_flange")
     return calibration.points_in_base_mm(points_in_camera_mm, base_from_flange=shot.base_from_flange)
+
+
+def pose_of(model: RobotModel | None, shot: SphereShot) -> dict[str, FloatArray]:
+    """The keyword that a calibration with this nominal robot (None: pose-only) wants for a shot's pose.
+
+    Raises:
+        DataError: the shot lacks the joints that it needs.
+    """
+    if model is None:
+        return {"base_from_flange": shot.base_from_flange}
+    if shot.joints_rad is None:
+        raise DataError(
+            f"shot {shot.index} has no joints, which this calibration of the whole robot needs",
+            remedy="Record joints, or use a calibration made from flange poses.",
+        )
+    return {"joints_rad": shot.joints_rad}
 
 
 def nominal_base_from_camera(

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 
+from acquire.cell import Cell
 from calibrate.observations import SphereShot
+from calibrate.result import Calibration
 from drivers.files.disk import write_text_atomic
 from drivers.kinematics.se3 import FloatArray
 from measure import plots
 from measure.plots import AFTER_COLOUR, LengthBar, ShotSeries
+from measure.report_facts import facts_of
 from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual
 from measure.report_text import (
     calibration_rows,
@@ -32,8 +35,31 @@ from measure.verify_result import VerifyResult
 _CHECK_COLOUR = "#7a3e9d"
 
 
-def write_page(path: str | Path, facts: CalibrationFacts, verification: VerifyResult | None = None, *, now: datetime.datetime | None = None) -> Path:
+def write_report(
+    path: str | Path,
+    calibration: Calibration,
+    verification: VerifyResult | None = None,
+    *,
+    cell: Cell | None = None,
+    session_names: Mapping[str, str] | None = None,
+) -> Path:
     """Write the report of a calibration, with or without a verification; returns the path.
+
+    Args:
+        path: the HTML file; it appears whole or not at all.
+        calibration: what is reported on.
+        verification: on shots that it never saw.
+        cell: for the camera's working range, and whether the cell is simulated.
+        session_names: names of the calibration's sessions by their digest.
+
+    Raises:
+        FileError: the folder is missing or not writable.
+    """
+    return write_page(path, facts_of(calibration, cell, session_names), verification)
+
+
+def write_page(path: str | Path, facts: CalibrationFacts, verification: VerifyResult | None = None, *, now: datetime.datetime | None = None) -> Path:
+    """Write a report from plain facts; returns the path.
 
     Args:
         path: the HTML file; it appears whole or not at all.

@@ -23,7 +23,8 @@ from drivers.files.session import Session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import Judgement, judge, overall
-from measure.placing import JudgedSystem, nominal_base_from_camera
+from measure.length_uncertainty import End, distance_standard_uncertainty_mm
+from measure.placing import JudgedSystem, nominal_base_from_camera, pose_of
 from measure.sphere_figures import Figures, SphereFigures, SphereSize, SphereView, figures_of, separation
 from measure.verify_result import LengthResult, SessionName, VerifyResult
 
@@ -93,7 +94,7 @@ def calibrated_placing(calibration: JudgedSystem) -> Placing:
     """Points of a shot through a calibration."""
 
     def place(shot: SphereShot, points: FloatArray) -> FloatArray:
-        return calibration.points_in_base_mm(points, **_pose_of(calibration, shot))
+        return calibration.points_in_base_mm(points, **pose_of(calibration.model, shot))
 
     return place
 
@@ -111,18 +112,6 @@ def _behind_surface(shot: SphereShot) -> FloatArray:
         return shot.centre_in_camera_mm
     mean = shot.points_in_camera_mm.mean(axis=0)
     return np.asarray(mean + 0.7 * shot.radius_mm * mean / np.linalg.norm(mean))
-
-
-def _pose_of(calibration: JudgedSystem, shot: SphereShot) -> dict[str, FloatArray]:
-    """The keyword that this calibration wants for a shot's pose."""
-    if calibration.model is None:
-        return {"base_from_flange": shot.base_from_flange}
-    if shot.joints_rad is None:
-        raise DataError(
-            f"shot {shot.index} has no joints, which this calibration of the whole robot needs",
-            remedy="Record joints, or use a calibration made from flange poses.",
-        )
-    return {"joints_rad": shot.joints_rad}
 
 
 def _training_shots(calibration: JudgedSystem, sessions: Sequence[Session]) -> list[tuple[Session, int]]:
@@ -178,23 +167,9 @@ def _length(calibration: JudgedSystem, length: CertifiedLength, figures: Figures
     measured, scatter = separation(ends[0], ends[1])
     test = float(np.hypot(scatter, length.standard_uncertainty_mm))
     shots = [[shot for shot in observations.shots if shot.sphere == name] for name in length.between]
-    total = float(np.hypot(test, _calibration_uncertainty_mm(calibration, ends, shots)))
+    predicted = distance_standard_uncertainty_mm(calibration, End(ends[0].centre_in_base_mm, shots[0]), End(ends[1].centre_in_base_mm, shots[1]))
+    total = float(np.hypot(test, predicted))
     return LengthResult(length.between, measured, length.length_mm, 2.0 * total, test, _why_not_judged(ends, shots))
-
-
-def _calibration_uncertainty_mm(calibration: JudgedSystem, ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> float:
-    """Standard uncertainty of the distance that the calibration's own covariance predicts.
-
-    The two ends are taken as independent, which is on the safe side: what moves both alike cancels in their difference.
-    """
-    difference = ends[1].centre_in_base_mm - ends[0].centre_in_base_mm
-    direction = difference / max(float(np.linalg.norm(difference)), 1e-12)
-
-    def variance(shot: SphereShot) -> float:
-        covariance = calibration.point_covariance_in_base_mm2(_behind_surface(shot)[None], **_pose_of(calibration, shot))[0]
-        return float(direction @ covariance @ direction)
-
-    return float(np.sqrt(sum(np.mean([variance(shot) for shot in end]) for end in shots)))
 
 
 def _why_not_judged(ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> str | None:

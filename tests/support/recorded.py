@@ -39,7 +39,8 @@ class TrueSystem:
     radius_offset_mm: float = 0.0
     limits: Limits | None = None
     shots: tuple[TrainedOn, ...] = ()
-    sigma_mm: float = 0.02
+    sigma_of_scale: float = 3e-5
+    sigma_of_radius_mm: float = 0.0
 
     @property
     def model(self) -> RobotModel | None:
@@ -54,10 +55,16 @@ class TrueSystem:
         flange = mdh.base_from_flange(self.cell.true, joints_rad) if joints_rad is not None else np.asarray(base_from_flange)
         return se3.apply(flange @ self.cell.flange_from_camera, points)
 
-    def point_covariance_in_base_mm2(
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the scale of the base, a shift of it along x in mm, and the radius offset."""
+        return np.diag([self.sigma_of_scale**2, 1.0, self.sigma_of_radius_mm**2])
+
+    def point_jacobian(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
     ) -> FloatArray:
-        return np.tile(np.eye(3) * self.sigma_mm**2, (len(np.asarray(points_in_camera_mm)), 1, 1))
+        points = self.points_in_base_mm(points_in_camera_mm, joints_rad=joints_rad, base_from_flange=base_from_flange)
+        return np.stack([points, np.tile([1.0, 0, 0], (len(points), 1))], axis=-1)
 
 
 def write_cell(folder: Path, places: dict[str, tuple[float, float, float]] = PLACES, *, limits: bool = True, kind: str = "area") -> Cell:

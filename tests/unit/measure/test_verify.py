@@ -59,13 +59,24 @@ def test_json_has_the_keys_that_stay(session: Session) -> None:
 
 
 def test_the_expanded_uncertainty_holds_calibration_scatter_and_reference(session: Session) -> None:
-    small, large = (verify(replace(SYSTEM, sigma_mm=sigma), [session]).lengths[0] for sigma in (0.0, 0.3))
+    small, large = (verify(replace(SYSTEM, sigma_of_scale=sigma), [session]).lengths[0] for sigma in (0.0, 1e-3))
     assert small.expanded_uncertainty_mm == pytest.approx(2 * small.test_standard_uncertainty_mm)
     assert small.test_standard_uncertainty_mm > 0.0025
-    # two independent ends of 0.3 mm
-    assert large.expanded_uncertainty_mm == pytest.approx(2 * np.hypot(0.3 * np.sqrt(2), small.test_standard_uncertainty_mm))
+    # a shift of the base moves both ends alike and counts for nothing; a scale counts with the whole length (and, since it
+    # makes the spheres larger too, a little through the fixed radius)
+    assert large.expanded_uncertainty_mm == pytest.approx(2 * np.hypot(1e-3 * large.measured_mm, small.test_standard_uncertainty_mm), rel=0.03)
     # the decision is charged with the test's uncertainty only
     assert large.test_standard_uncertainty_mm == small.test_standard_uncertainty_mm
+
+
+def test_the_radius_offsets_uncertainty_moves_centres_as_a_refit_does(session: Session) -> None:
+    """First order against the difference of two fits with other radii."""
+    step = 1e-3
+    low, high = (verify(replace(SYSTEM, radius_offset_mm=r, sigma_of_scale=0.0), [session]).lengths[0].measured_mm for r in (-step, step))
+    expected = abs(high - low) / (2 * step) * 0.1
+    plain, unsure = (verify(replace(SYSTEM, sigma_of_scale=0.0, sigma_of_radius_mm=s), [session]).lengths[0] for s in (0.0, 0.1))
+    found = np.sqrt(unsure.expanded_uncertainty_mm**2 - plain.expanded_uncertainty_mm**2) / 2
+    assert found == pytest.approx(expected, rel=0.1, abs=1e-4)
 
 
 def test_without_limits_nothing_is_proven(tmp_path: Path) -> None:

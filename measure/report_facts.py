@@ -1,0 +1,111 @@
+"""From a calibration to the plain facts that a report states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from acquire.cell import Cell
+from calibrate.result import Calibration, ShotResult
+from drivers.kinematics.se3 import FloatArray
+from measure.report_page import CalibrationFacts, ShotResidual
+
+_DATUM_TEXTS = {
+    "nominal_robot": "base = best fit of the calibrated to the nominal robot over the poses used",
+    "controller": "base = as the controller reports it",
+}
+
+
+def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: Mapping[str, str] | None = None) -> CalibrationFacts:
+    """What a report says of a calibration.
+
+    Args:
+        calibration: the calibration.
+        cell: for the camera's working range, and whether the cell is simulated.
+        session_names: names by digest; digests are shortened where there is none.
+    """
+    names = session_names or {}
+    statistics = calibration.statistics
+    return CalibrationFacts(
+        id=calibration.id,
+        cell_name=calibration.cell_name,
+        verdict=calibration.verdict,
+        reasons=calibration.reasons,
+        method=calibration.method,
+        camera_error=_camera_error_text(calibration),
+        n_shots=statistics.n_shots,
+        used=statistics.used,
+        rejected=tuple((_name(names, r.session), r.index, r.reason) for r in calibration.rejected),
+        rank=statistics.rank,
+        n_parameters=statistics.n_parameters,
+        train_rms_mm=statistics.train_rms_mm,
+        cross_validated_rms_mm=statistics.cross_validated_rms_mm,
+        radius_offset_mm=calibration.radius_offset_mm,
+        datum=_DATUM_TEXTS.get(calibration.datum.kind, calibration.datum.kind),
+        simulated=_is_simulated(calibration, cell),
+        identity=dict(_identity(calibration, names)),
+        shots=tuple(_residual(shot) for shot in calibration.shots),
+        residual_name=_residual_name(calibration.shots),
+        seen_mm=calibration.camera_seen_volume_mm,
+        working_range_mm=None if cell is None else cell.camera.working_range_mm,
+        limits=calibration.limits,
+        correction_mm=None if not len(calibration.camera_mm) else _correction(calibration),
+    )
+
+
+def _correction(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
+    def correction_mm(points_in_camera_mm: FloatArray) -> FloatArray:
+        return calibration.corrected_points_in_camera_mm(points_in_camera_mm) - points_in_camera_mm
+
+    return correction_mm
+
+
+def _camera_error_text(calibration: Calibration) -> str:
+    compared = calibration.statistics.compared
+    if not compared:
+        return calibration.camera_error.name
+    tried = ", ".join(f"{name} {rms:.3f}" for name, rms in compared.items())
+    return f"{calibration.camera_error.name} (left-out rms, mm: {tried})"
+
+
+def _residual(shot: ShotResult) -> ShotResidual:
+    value = shot.radial_rms_mm if shot.predicted_error_mm is None else shot.predicted_error_mm
+    return ShotResidual(shot.session, shot.index, shot.sphere, value, shot.centre_in_camera_mm)
+
+
+def _residual_name(shots: Sequence[ShotResult]) -> str:
+    is_centre = any(shot.centre_in_base_mm is not None for shot in shots)
+    return "distance from sphere centre, mm" if is_centre else "radial rms, mm"
+
+
+def _is_simulated(calibration: Calibration, cell: Cell | None) -> bool:
+    drivers = () if cell is None else (cell.robot.driver, cell.camera.driver)
+    return "simulated" in {*drivers, *(str(value) for value in calibration.identity.values())}
+
+
+def _identity(calibration: Calibration, names: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    yield "calibrated", f"{calibration.created_utc} by {calibration.software}"
+    yield "robot model", "none: flange poses as the controller reports them" if calibration.model is None else calibration.model.name
+    yield from _flat(calibration.identity, "")
+    yield from ((f"input {key}", value) for key, value in _flat(calibration.inputs, ""))
+    yield from ((f"calibration session {name}", digest) for digest, name in names.items())
+    if calibration.seen_joints_rad is not None:
+        low, high = np.degrees(calibration.seen_joints_rad)
+        yield "axis ranges used", ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in zip(low, high, strict=True))
+
+
+def _flat(value: object, path: str) -> Iterator[tuple[str, str]]:
+    """Nested mappings and lists as lines."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _flat(item, f"{path} {key}".strip().replace("_", " "))
+    elif isinstance(value, list | tuple):
+        for number, item in enumerate(value, start=1):
+            yield from _flat(item, f"{path} {number}".strip())
+    elif value is not None:
+        yield path, str(value)
+
+
+def _name(names: Mapping[str, str], digest: str) -> str:
+    return names.get(digest, digest[:12])
