@@ -13,6 +13,8 @@ from drivers.kinematics.se3 import FloatArray
 
 # No brake, overtravel or zero error lets an axis stand this far beyond its limit.
 _BEYOND_LIMIT_RAD = 0.5
+# A model's limits may be narrower than the real arm's: within one turn an angle is believed whatever they say.
+_ANY_SERIAL_ARM_RAD = 2 * np.pi
 # Where a model states no limits: no axis of an arm counts more than four turns.
 _ANY_AXIS_LIMIT_RAD = 8 * np.pi
 
@@ -64,7 +66,7 @@ def _check_angles(session: Session, model: RobotModel) -> None:
     if not shots:
         return
     joints = np.array([shot.joints_rad for shot in shots])
-    beyond = beyond_limits_rad(model, joints)
+    beyond = np.minimum(beyond_limits_rad(model, joints), np.maximum(np.abs(joints) - _ANY_SERIAL_ARM_RAD, 0.0))
     worst = int(beyond.max(axis=1).argmax())
     if beyond[worst].max() <= _BEYOND_LIMIT_RAD:
         return
