@@ -1,0 +1,1 @@
+"""Using the calibrated cell: verify, stitch, report, viewer, and the command `spherecal`."""

@@ -8,8 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from acquire.cell import Limits
+from acquire.cell import Cell, Limits, cell_of_session, robot_model_of
+from acquire.check import check_session
 from calibrate.observations import SphereShot
+from calibrate.plausibility import check_reported_poses
 from drivers.errors import DataError
 from drivers.files.session import Session, Shot
 from drivers.kinematics import mdh, se3
@@ -74,6 +76,33 @@ class JudgedSystem(MeasuringSystem, Protocol):
     ) -> FloatArray:
         """(n, 3, p) motion of calibrated points per parameter."""
         ...
+
+
+def check_fits(calibration: MeasuringSystem, session: Session, cell: Cell | None = None) -> None:
+    """Refuse sessions that this calibration cannot measure.
+
+    Raises:
+        FileError: the session does not fit its own cell: axes, units, names of spheres.
+        DataError: it was recorded with another robot, or its poses contradict its axis angles.
+    """
+    cell = cell or cell_of_session(session)
+    model = robot_model_of(cell, session)
+    check_session(session, cell, model)
+    if calibration.model is None or model is None:
+        return
+    check_reported_poses([session], model)
+    if not _same_geometry(calibration.model, model):
+        raise DataError(
+            f"the session was recorded with robot model {model.name}, the calibration is of {calibration.model.name} or another version of it",
+            file=session.folder,
+            remedy="Use the calibration of this robot.",
+        )
+
+
+def _same_geometry(first: RobotModel, second: RobotModel) -> bool:
+    names = ("a_mm", "alpha_rad", "d_mm", "theta_offset_rad", "coupling")
+    pairs = [(np.asarray(getattr(first, name)), np.asarray(getattr(second, name))) for name in names]
+    return all(a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-9) for a, b in pairs)
 
 
 def points_of_shot_in_base_mm(calibration: MeasuringSystem, session: Session, shot: Shot, points_in_camera_mm: ArrayLike) -> FloatArray:

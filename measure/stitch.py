@@ -15,7 +15,7 @@ from drivers.errors import DataError
 from drivers.files.ply import PointCloud, write_ply
 from drivers.files.session import Session, Shot, read_scan
 from measure.fuse import FusedCloud, VoxelGrid, flying_pixel_mask
-from measure.placing import MeasuringSystem, points_of_shot_in_base_mm
+from measure.placing import MeasuringSystem, check_fits, points_of_shot_in_base_mm
 
 Progress = Callable[[int, int], None]
 """Called after each scan with the number done and the number of all."""
@@ -97,6 +97,7 @@ def stitch(
     """
     began = time.perf_counter()
     grid = VoxelGrid(voxel_mm)
+    check_fits(calibration, session)
     shots = scans_once(session)
     n_valid = n_edge = n_outside = 0
     for done, (shot, cloud) in enumerate(_read_ahead(session, shots), start=1):

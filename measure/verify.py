@@ -24,7 +24,7 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import Judgement, judge, overall
 from measure.length_uncertainty import End, distance_standard_uncertainty_mm
-from measure.placing import JudgedSystem, nominal_base_from_camera, pose_of
+from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
 from measure.sphere_figures import Figures, SphereFigures, SphereSize, SphereView, figures_of, separation
 from measure.verify_result import LengthResult, SessionName, VerifyResult
 
@@ -60,6 +60,8 @@ def verify(
     """
     began = time.perf_counter()
     cells = [cell or cell_of_session(session) for session in sessions]
+    for session, its_cell in zip(sessions, cells, strict=True):
+        check_fits(calibration, session, its_cell)
     trained = _training_shots(calibration, sessions)
     if trained and not allow_training_data:
         raise _flattering(trained)

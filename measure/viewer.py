@@ -28,7 +28,7 @@ TIMELINE = "pose"
 BEFORE_COLOUR = (226, 114, 43)
 AFTER_COLOUR = (38, 166, 190)
 STITCHED_COLOUR = (190, 200, 210)
-ROBOT_COLOUR = (245, 158, 11, 255)
+ROBOT_COLOUR = (150, 158, 172, 255)
 
 _MM = 1e-3
 _UI_POINT = -1.5  # negative radii are pixels
@@ -285,10 +285,10 @@ def _eye(scene: Scene) -> Any:
     if not places:
         return None
     middle = np.mean(places, axis=0)
-    target = 0.6 * middle + np.array([0, 0, 150.0])
+    target = 0.55 * middle + np.array([0, 0, 0.4 * np.linalg.norm(middle)])
     away = np.array([middle[0], middle[1], 0.0])
     reach = max(float(np.linalg.norm(away)), 400.0)
     forward = away / max(float(np.linalg.norm(away)), 1.0)
     side = np.array([forward[1], -forward[0], 0.0])
-    position = target + reach * (0.7 * forward + 1.5 * side) + np.array([0, 0, 0.8 * reach])
+    position = target + reach * (1.2 * forward + 2.1 * side) + np.array([0, 0, 0.7 * reach])
     return rrb.EyeControls3D(position=position * _MM, look_target=target * _MM, eye_up=(0, 0, 1))

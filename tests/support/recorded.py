@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from acquire.cell import Cell, Limits, load_cell
+from acquire.cell import Cell, Limits, load_cell, robot_model_of
 from acquire.session import SessionWriter
+from calibrate.camera_error import PillowError
+from calibrate.datum import nominal_robot_datum
+from calibrate.normal import NoiseModel
+from calibrate.observations import RejectedShot, gather_observations
+from calibrate.result import Calibration, ShotResult, Statistics
 from drivers.files.session import Session, read_session
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import mdh, se3
@@ -117,3 +123,45 @@ def record_session(
                     xyz_mm=shot.points_in_camera_mm.astype(np.float32),
                 )
     return read_session(folder)
+
+
+def nominal_calibration(cell: Cell, sessions: Sequence[Session]) -> Calibration:
+    """A calibration that leaves robot, first guess and camera as they are; what it states of itself is made up."""
+    model = robot_model_of(cell)
+    if model is None or cell.flange_from_camera is None:
+        raise LookupError("the cell must have a robot and a first guess")
+    observations = gather_observations(sessions, cell=cell, model=model)
+    joints = np.array([shot.joints_rad for shot in observations.shots], dtype=np.float64)
+    places = np.array([shot.points_in_camera_mm.mean(axis=0) for shot in observations.shots])
+    return Calibration(
+        id="c" * 64,
+        method="clouds",
+        model=model,
+        link_twists=np.zeros((6, 6)),
+        flange_from_camera=cell.flange_from_camera,
+        camera_error=PillowError(n_terms=1),
+        camera_mm=np.array([0.05]),
+        camera_seen_volume_mm=np.array([places.min(axis=0), places.max(axis=0)]),
+        radius_offset_mm=0.01,
+        sphere_centres_in_base_mm={name: np.array(place) for name, place in PLACES.items()},
+        sphere_radius_offsets_mm=dict.fromkeys(PLACES, 0.01),
+        datum=nominal_robot_datum(model, np.zeros((6, 6)), joints),
+        seen_joints_rad=np.array([joints.min(axis=0), joints.max(axis=0)]),
+        noise=NoiseModel(point_mm=0.05, pose_mm=0.01, pose_rad=1e-4),
+        parameter_names=(),
+        covariance=1e-6 * np.eye(44),
+        statistics=Statistics(len(places), len(places), 25, 43, 80.0, 0.05, 0.06, 0.055, 1.0, 4, 1.0, {"none": 0.2, "pillow": 0.06}),
+        limits=cell.limits,
+        verdict="pass",
+        reasons=("the limits are kept",),
+        shots=tuple(
+            ShotResult(s.session, s.index, s.sphere, s.scan_sha256, len(s.points_in_camera_mm), 0.04, 0.05, place, np.zeros(3), 0.06)
+            for s, place in zip(observations.shots, places, strict=True)
+        ),
+        rejected=(RejectedShot(sessions[0].digest, 99, "coverage: the cap <is> too small"),),
+        cell_name=cell.name,
+        inputs={"cell_sha256": cell.sha256, "sessions": [session.digest for session in sessions]},
+        identity={"robot_serial": "1410-<42>"},
+        created_utc="2026-01-01T00:00:00Z",
+        software="spherecal 0",
+    )

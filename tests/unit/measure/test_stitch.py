@@ -114,7 +114,7 @@ def test_a_session_without_a_good_scan_is_told(tmp_path: Path) -> None:
 
 def one_scan(folder: Path, xyz_mm: FloatImage, *, joints: bool = True) -> Session:
     with SessionWriter.create(folder / "session", purpose="workpiece", cell=write_cell(folder)) as writer:
-        writer.append(joints_rad=np.zeros(6) if joints else None, base_from_flange=np.eye(4), xyz_mm=xyz_mm)
+        writer.append(joints_rad=np.zeros(6) if joints else None, base_from_flange=None if joints else np.eye(4), xyz_mm=xyz_mm)
     return read_session(folder / "session")
 
 

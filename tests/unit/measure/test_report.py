@@ -1,0 +1,156 @@
+"""The report: self-contained, escaped, complete in all its variants, and true to the figures it is given."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquire.cell import Cell
+from calibrate.result import Calibration
+from drivers.errors import FileError
+from drivers.files.session import Session
+from measure.report import write_page, write_report
+from measure.report_facts import facts_of
+from measure.verify import verify
+from measure.verify_result import VerifyResult
+from tests.support.recorded import TrueSystem, nominal_calibration, record_session, write_cell
+from tests.support.synthetic import paper_cell
+
+VOID = {"meta", "br", "img", "link", "hr", "input"}
+
+
+class Reader(HTMLParser):
+    """Collects the text, and complains about tags that do not nest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.text.append(data)
+
+
+def read(path: Path) -> tuple[str, set[str]]:
+    reader = Reader()
+    reader.feed(path.read_text(encoding="utf-8"))
+    reader.close()
+    assert reader.open == []
+    return re.sub(r"\s+", " ", " ".join(reader.text)), reader.tags
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+    return write_cell(tmp_path_factory.mktemp("cell"))
+
+
+@pytest.fixture(scope="module")
+def session(cell: Cell) -> Session:
+    return record_session(cell.folder / "calib", cell, np.random.default_rng(1), shots_per_sphere=4, purpose="calibration")
+
+
+@pytest.fixture(scope="module")
+def calibration(cell: Cell, session: Session) -> Calibration:
+    return nominal_calibration(cell, [session])
+
+
+@pytest.fixture(scope="module")
+def verification(cell: Cell) -> VerifyResult:
+    unseen = record_session(cell.folder / "verif", cell, np.random.default_rng(2), shots_per_sphere=5)
+    return verify(TrueSystem(paper_cell()), [unseen])
+
+
+def test_the_page_needs_nothing_but_itself(calibration: Calibration, verification: VerifyResult, cell: Cell, tmp_path: Path) -> None:
+    path = write_report(tmp_path / "report.html", calibration, verification, cell=cell)
+    html = path.read_text(encoding="utf-8")
+    _, tags = read(path)
+    assert not {"script", "link", "img", "iframe", "object"} & tags
+    links = re.findall(r'(?:href|src)="([^"]*)"', html) + re.findall(r"url\(([^)]*)\)", html)
+    assert all(link.startswith(("#", "data:")) for link in links)
+    assert html.count("<svg") == 8
+
+
+def test_it_says_what_was_found(calibration: Calibration, verification: VerifyResult, cell: Cell, session: Session, tmp_path: Path) -> None:
+    text, _ = read(write_report(tmp_path / "report.html", calibration, verification, cell=cell, session_names={session.digest: "calib"}))
+    figures = verification.figures
+    assert figures.centre_rms_mm is not None
+    assert verification.before is not None
+    assert verification.before.centre_rms_mm is not None
+    for value in (figures.centre_rms_mm, verification.before.centre_rms_mm, figures.radial_rms_mm):
+        assert f"{value:.3f} mm" in text
+    length = verification.lengths[0]
+    for shown in (f"{length.measured_mm:.3f}", f"{length.error_mm:+.3f}", f"{length.expanded_uncertainty_mm:.3f}"):
+        assert shown in text
+    assert calibration.id in text
+    assert session.digest in text
+    assert all(reason in text for reason in verification.reasons)
+    assert "calib 99 coverage: the cap <is> too small" in text
+    assert "none 0.200, pillow 0.060" in text
+
+
+def test_text_from_files_cannot_become_markup(calibration: Calibration, cell: Cell, tmp_path: Path) -> None:
+    evil = replace(calibration, cell_name="<script>alert(1)</script>")
+    path = write_report(tmp_path / "report.html", evil, cell=cell)
+    assert "<script" not in path.read_text(encoding="utf-8")
+    assert "<script>alert(1)</script>" in read(path)[0]
+
+
+@pytest.mark.parametrize(("verdict", "headline"), [("pass", "not yet verified"), ("marginal", "marginal"), ("fail", "failed")])
+def test_a_calibration_alone_is_never_called_conform(calibration: Calibration, verdict: str, headline: str, tmp_path: Path) -> None:
+    text, _ = read(write_report(tmp_path / "report.html", replace(calibration, verdict=verdict)))
+    assert headline in text
+    assert "Conform" not in text
+    assert "No verification was given" in text
+
+
+def test_simulated_cells_and_training_data_are_remarked(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
+    plain, _ = read(write_report(tmp_path / "plain.html", calibration, verification))
+    assert "never from hardware" not in plain
+    assert "figures flatter" not in plain
+    simulated = replace(calibration, identity={"camera_serial": "simulated"})
+    text, _ = read(write_report(tmp_path / "remarked.html", simulated, replace(verification, held_out=False)))
+    assert "never from hardware" in text
+    assert "figures flatter" in text
+
+
+def test_bare_facts_make_a_page_too(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
+    """No limits, no first guess, no lengths, no camera model, no shots."""
+    facts = replace(facts_of(calibration), limits=None, shots=(), correction_mm=None, seen_mm=None, cross_validated_rms_mm=None, rejected=())
+    bare = replace(verification, before=None, lengths=(), before_length_errors_mm={}, limits=None, judgements=(), verdict="not_proven", reasons=())
+    text, _ = read(write_page(tmp_path / "report.html", facts, bare))
+    assert "Not proven" in text
+    assert "none" in text
+
+
+def test_the_same_facts_give_the_same_bytes(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
+    moment = datetime.datetime(2026, 1, 2, tzinfo=datetime.UTC)
+    one, two = (write_page(tmp_path / name, facts_of(calibration), verification, now=moment).read_bytes() for name in ("a.html", "b.html"))
+    assert one == two
+    assert b"2026-01-02 00:00 UTC" in one
+
+
+def test_line_profiles_show_radial_figures(calibration: Calibration, tmp_path: Path) -> None:
+    arcs = tuple(replace(shot, centre_in_base_mm=None, predicted_error_mm=None) for shot in calibration.shots)
+    text, _ = read(write_report(tmp_path / "report.html", replace(calibration, shots=arcs)))
+    assert "radial rms, mm" in text
+
+
+def test_a_missing_folder_is_told(calibration: Calibration, tmp_path: Path) -> None:
+    with pytest.raises(FileError):
+        write_report(tmp_path / "none" / "report.html", calibration)
