@@ -23,8 +23,8 @@ class Way:
         self._points: list[FloatArray] = []
         self._places: dict[str, int] = {}
         self._has_vias = False
-        self._place = -1
-        self._between = False
+        # the robot stands at this point of the way, or between these two neighbours; -1 is anywhere before the first
+        self._low = self._high = -1
         for pose in poses:
             self.add(pose)
 
@@ -39,7 +39,7 @@ class Way:
         if joints_rad is None:
             return
         near = [i for i, point in enumerate(self._points) if len(point) == len(joints_rad) and np.abs(point - joints_rad).max() <= tolerance_rad]
-        self._place = near[0] if near else -1
+        self._low = self._high = near[0] if near else -1
 
     def to(self, pose: PlannedPose) -> Iterator[FloatArray]:
         """Points (n,) to pass up to a pose; a point counts as passed when the next one is asked for."""
@@ -48,12 +48,13 @@ class Way:
             yield pose.joints_rad
             return
         for place in self._walk(goal):
-            self._between = True
+            self._low, self._high = min(self._low, place), max(self._high, place)
             yield self._points[place]
-            self._place, self._between = place, False
+            self._low = self._high = place
 
     def _walk(self, goal: int) -> range:
-        if goal > self._place:
-            return range(self._place + 1, goal + 1)
-        first = self._place if self._between or goal == self._place else self._place - 1
-        return range(first, goal - 1, -1)
+        """Points from the next one to the goal; where the robot left off between two, the one on that side first."""
+        between = self._low < self._high
+        if goal < self._low or (between and goal == self._low):
+            return range(self._low if between else self._low - 1, goal - 1, -1)
+        return range(self._high if between or goal == self._high else self._high + 1, goal + 1)
