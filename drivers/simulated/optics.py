@@ -13,6 +13,7 @@ from drivers.kinematics.se3 import FloatArray
 from drivers.simulated.truth import CameraErrorTruth, CameraTruth, FieldTruth, NoError, PillowTruth, StereoTruth
 
 _PILLOW_TOLERANCE_MM = 1e-9
+_PILLOW_LIMIT = 0.1
 _PILLOW_PASSES = 60
 
 
@@ -74,8 +75,10 @@ def _pillow(error: PillowTruth, points: FloatArray) -> FloatArray:
     result = points.copy()
     # the error is a function of the measured point: solve z = z_true + e(x, z); e changes by percents of z at most
     for _ in range(_PILLOW_PASSES):
-        z = points[:, 2] + pillow_depth_error(error, result[:, 0], result[:, 2])
-        change = np.abs(z - result[:, 2]).max(initial=0.0)
+        shift = pillow_depth_error(error, result[:, 0], result[:, 2])
+        # far outside the working range the powers run away: no point is measured there
+        z = points[:, 2] + np.where(np.abs(shift) < _PILLOW_LIMIT * points[:, 2], shift, np.nan)
+        change = np.abs(z - result[:, 2]).max(initial=0.0, where=np.isfinite(z))
         result[:, 2] = z
         if change < _PILLOW_TOLERANCE_MM:
             break
