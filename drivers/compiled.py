@@ -11,6 +11,8 @@ from typing import TypeVar, cast
 
 # Open3D loads an older libtbb that numba refuses with a warning; OpenMP (libgomp1) works beside it.
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
+# Waiting threads that spin take the cores from whoever else computes: ten times slower on a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
 

@@ -1,0 +1,85 @@
+"""What the data determine and what is gauge: rank, gap and condition of the scaled normal equations (METHOD.md 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.clouds import Solution
+from calibrate.normal import symmetric_inverse
+from calibrate.problem import Layout, Problem
+from drivers.kinematics.se3 import FloatArray
+
+ANGLE_SCALE_MM = 500.0
+"""A radian counts as what it moves at this distance."""
+_RELATIVE_ZERO = 1e-8
+"""Of squared singular values: what the pose noise breaks of the gauge stays below it, what shots determine above."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identifiability:
+    """Rank of robot, hand-eye and camera, everything else projected out."""
+
+    rank: int
+    n_parameters: int
+    expected_rank: int
+    """What a well-spread set of shots determines: 4 per axis (or 6 of a hand-eye alone), and every camera term."""
+    condition: float
+    """Of the Jacobian over the determined directions."""
+    gap: float
+    """Ratio of the weakest determined to the strongest undetermined singular value; infinite without gauge."""
+    singular_values: FloatArray
+    """Of the Jacobian in scaled units (mm), whitened by the noise; falling."""
+
+
+def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
+    """Look at a solution's information about its geometric unknowns, priors of these left out."""
+    layout = problem.layout
+    n = layout.n_geometric
+    information = _data_information(solution)
+    nuisance = information[n:, n:] + np.diag(_nuisance_prior(problem))
+    cross = information[:n, n:]
+    projected = information[:n, :n] - cross @ symmetric_inverse(nuisance) @ cross.T
+    scale = parameter_scale(layout)
+    values = np.linalg.eigvalsh(projected / scale[:, None] / scale)[::-1]
+    rank = int((values > _RELATIVE_ZERO * values[0]).sum())
+    singular = np.sqrt(np.maximum(values, 0.0))
+    return Identifiability(
+        rank=rank,
+        n_parameters=n,
+        expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera,
+        condition=float(singular[0] / singular[rank - 1]),
+        gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if rank < n else float("inf"),
+        singular_values=singular,
+    )
+
+
+def parameter_scale(layout: Layout) -> FloatArray:
+    """(n,) mm per unit of each geometric unknown."""
+    twist = [1.0] * 3 + [ANGLE_SCALE_MM] * 3
+    return np.array(twist * (layout.n_links + 1) + [1.0] * layout.n_camera)
+
+
+def parameter_names(layout: Layout, spheres: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of all unknowns, with their units."""
+    twist = ["rho_x_mm", "rho_y_mm", "rho_z_mm", "phi_x_rad", "phi_y_rad", "phi_z_rad"]
+    names = [f"link{i + 1}.{part}" for i in range(layout.n_links) for part in twist]
+    names += [f"hand_eye.{part}" for part in twist]
+    names += [f"camera.{k}_mm" for k in range(layout.n_camera)]
+    names += ["radius_offset_mm"]
+    names += [f"sphere.{name}.radius_mm" for name in spheres]
+    names += [f"sphere.{name}.{axis}_mm" for name in spheres for axis in "xyz"]
+    return tuple(names)
+
+
+def _data_information(solution: Solution) -> FloatArray:
+    """Points and lengths alone, pose noise eliminated."""
+    gain = solution.reduced.noise_inverse @ solution.linearised.cross
+    flat = solution.linearised.cross.reshape(-1, gain.shape[-1])
+    return np.asarray(solution.linearised.data_hessian - flat.T @ gain.reshape(flat.shape))
+
+
+def _nuisance_prior(problem: Problem) -> FloatArray:
+    offset = [problem.priors.radius_offset_mm**-2]
+    return np.concatenate([offset, problem.radius_sigma_mm**-2.0, np.zeros(3 * len(problem.radius_mm))])

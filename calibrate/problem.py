@@ -1,0 +1,232 @@
+"""The whole-cloud problem: what is known, what is sought, and its linearisation (METHOD.md 4).
+
+Residual of point i of shot j on sphere s: `|W_ij + e_j - c_s| - (R_s + dR + dR_s)`, W the corrected point in the base,
+e_j the displacement that the pose noise of the shot's scan causes at the sphere.
+
+Unknowns, in this order: link twists (6 n), hand-eye (6), camera coefficients (k), the shared radius offset dR (1), a
+radius deviation per sphere within its certificate (S), sphere centres (3 S). The pose noise is a nuisance twist per scan,
+`(t mm, w rad)` about the flange origin in base axes, with prior `diag(s_t² I, s_r² I)`: at the centre it displaces by
+`t + w x (c - f)`, which is METHOD.md's N_j = s_t² I + s_r² hat(l) hat(l)', and two spheres in one scan share it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.camera_error import CameraError
+from calibrate.datum import link_columns, twist_columns
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """What is believed before any data, as standard deviations of physical size."""
+
+    link_rho_mm: float = 1.0
+    link_phi_rad: float = 2e-3
+    radius_offset_mm: float = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LengthConstraint:
+    """A certified length between the centres of two spheres (indices)."""
+
+    first: int
+    second: int
+    length_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """All data of a solve; m shots, n axes, S spheres, G scans, N points."""
+
+    model: RobotModel | None
+    joints_rad: FloatArray | None
+    """(m, n), or None for pose-only data."""
+    base_from_flange: FloatArray
+    """(m, 4, 4): reported poses, or the nominal model's."""
+    scan: IntArray
+    """(m,) index of the scan a shot was seen in."""
+    sphere: IntArray
+    """(m,) index of the shot's sphere."""
+    points_in_camera_mm: FloatArray
+    """(N, 3), shot by shot."""
+    starts: IntArray
+    """(m + 1,)."""
+    camera_error: CameraError
+    basis: FloatArray
+    """(N, k) of the camera error model."""
+    radius_mm: FloatArray
+    """(S,) certified."""
+    radius_sigma_mm: FloatArray
+    """(S,) standard uncertainty of the certified radius."""
+    lengths: tuple[LengthConstraint, ...] = ()
+    priors: Priors = field(default_factory=Priors)
+    along_sight: bool = True
+    """Whether residuals run along the line of sight from the camera's origin (area cameras)."""
+
+    @property
+    def n_shots(self) -> int:
+        """Number of shots m."""
+        return int(self.scan.shape[0])
+
+    @property
+    def n_scans(self) -> int:
+        """Number of scans G."""
+        return int(self.scan.max()) + 1 if self.n_shots else 0
+
+    @property
+    def layout(self) -> Layout:
+        """Where each unknown sits."""
+        n_links = 0 if self.joints_rad is None else self.joints_rad.shape[1]
+        return Layout(n_links, len(self.camera_error.axis), len(self.radius_mm))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Slices of the vector of unknowns."""
+
+    n_links: int
+    n_camera: int
+    n_spheres: int
+
+    @property
+    def links(self) -> slice:
+        """Link twists."""
+        return slice(0, 6 * self.n_links)
+
+    @property
+    def hand_eye(self) -> slice:
+        """Hand-eye update."""
+        return slice(6 * self.n_links, 6 * self.n_links + 6)
+
+    @property
+    def camera(self) -> slice:
+        """Camera coefficients."""
+        return slice(self.hand_eye.stop, self.hand_eye.stop + self.n_camera)
+
+    @property
+    def radius_offset(self) -> slice:
+        """The shared optical radius offset."""
+        return slice(self.camera.stop, self.camera.stop + 1)
+
+    @property
+    def sphere_radius(self) -> slice:
+        """Radius deviation of each sphere."""
+        return slice(self.radius_offset.stop, self.radius_offset.stop + self.n_spheres)
+
+    @property
+    def centres(self) -> slice:
+        """Sphere centres."""
+        return slice(self.sphere_radius.stop, self.sphere_radius.stop + 3 * self.n_spheres)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return int(self.centres.stop)
+
+    @property
+    def n_geometric(self) -> int:
+        """Robot, hand-eye and camera: what rank and n_parameters count."""
+        return int(self.camera.stop)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Values of all unknowns, nuisances included."""
+
+    link_twists: FloatArray
+    """(n, 6), (0, 6) for pose-only data."""
+    flange_from_camera: FloatArray
+    camera_mm: FloatArray
+    """(k,)."""
+    radius_offset_mm: float
+    sphere_radius_deviation_mm: FloatArray
+    """(S,)."""
+    centres_in_base_mm: FloatArray
+    """(S, 3)."""
+    pose_noise: FloatArray
+    """(G, 6) nuisance twists (t mm, w rad) about the flange origin, base axes."""
+
+    def moved(self, layout: Layout, step: FloatArray, noise_step: FloatArray) -> State:
+        """The state after a Gauss-Newton step (size,) and nuisance steps (G, 6)."""
+        return State(
+            link_twists=self.link_twists + step[layout.links].reshape(-1, 6),
+            flange_from_camera=se3.exp(step[layout.hand_eye]) @ self.flange_from_camera,
+            camera_mm=self.camera_mm + step[layout.camera],
+            radius_offset_mm=self.radius_offset_mm + float(step[layout.radius_offset][0]),
+            sphere_radius_deviation_mm=self.sphere_radius_deviation_mm + step[layout.sphere_radius],
+            centres_in_base_mm=self.centres_in_base_mm + step[layout.centres].reshape(-1, 3),
+            pose_noise=self.pose_noise + noise_step,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Geometry:
+    """Where every shot's camera is and how its sphere's centre would move with each unknown."""
+
+    base_from_flange: FloatArray
+    """(m, 4, 4), corrected."""
+    base_from_camera: FloatArray
+    """(m, 4, 4)."""
+    centre_in_camera_mm: FloatArray
+    """(m, 3) where the shot's sphere is expected, nuisance included."""
+    columns: FloatArray
+    """(m, v - 1, P): rows u (camera axes), camera basis, radius; columns the unknowns."""
+    noise_columns: FloatArray
+    """(m, 3, 6): displacement in camera axes per nuisance twist."""
+
+
+def corrected_chain(problem: Problem, link_twists: FloatArray) -> FloatArray:
+    """`base_from_link_i` (m, n + 1, 4, 4) of every shot; a chain of one frame for pose-only data."""
+    if problem.model is None or problem.joints_rad is None:
+        return problem.base_from_flange[:, None]
+    return mdh.chain(problem.model, problem.joints_rad, link_twists)
+
+
+def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None = None) -> Geometry:
+    """Camera poses, expected centres and Jacobian columns of all shots at a state."""
+    layout = problem.layout
+    frames = corrected_chain(problem, state.link_twists) if frames is None else frames
+    base_from_flange = frames[:, -1]
+    base_from_camera = base_from_flange @ state.flange_from_camera
+    centre = state.centres_in_base_mm[problem.sphere]
+    lever = centre - base_from_flange[:, :3, 3]
+    noise_columns = np.concatenate([np.broadcast_to(np.eye(3), (problem.n_shots, 3, 3)), -se3.hat(lever)], axis=-1)
+    noise = np.einsum("mij,mj->mi", noise_columns, state.pose_noise[problem.scan])
+    moving_point = centre - noise
+    camera_from_base_rotation = np.swapaxes(base_from_camera[:, :3, :3], -1, -2)
+    motion = np.zeros((problem.n_shots, 3, layout.size))
+    if problem.model is not None and problem.joints_rad is not None:
+        motion[:, :, layout.links] = link_columns(problem.model, problem.joints_rad, frames, state.link_twists, moving_point)
+    motion[:, :, layout.hand_eye] = twist_columns(base_from_flange, moving_point)
+    rows = np.arange(problem.n_shots)
+    for axis in range(3):
+        motion[rows, axis, layout.centres.start + 3 * problem.sphere + axis] -= 1.0
+    columns = np.zeros((problem.n_shots, layout.n_camera + 4, layout.size))
+    columns[:, :3] = camera_from_base_rotation @ motion
+    for k in range(layout.n_camera):
+        columns[:, 3 + k, layout.camera.start + k] = 1.0
+    columns[:, -1, layout.radius_offset.start] = 1.0
+    columns[rows, -1, layout.sphere_radius.start + problem.sphere] = 1.0
+    return Geometry(
+        base_from_flange=base_from_flange,
+        base_from_camera=base_from_camera,
+        centre_in_camera_mm=se3.apply(se3.inverse(base_from_camera), moving_point),
+        columns=columns,
+        noise_columns=camera_from_base_rotation @ noise_columns,
+    )
+
+
+def expected_radius_mm(problem: Problem, state: State) -> FloatArray:
+    """(m,) radius at which each shot's sphere should read."""
+    radius = problem.radius_mm + state.radius_offset_mm + state.sphere_radius_deviation_mm
+    return np.asarray(radius[problem.sphere])

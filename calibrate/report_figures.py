@@ -1,0 +1,166 @@
+"""From a solve to its result: datum, covariance, statistics, verdict."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.cell import Cell
+from calibrate.assemble import Assembled
+from calibrate.clouds import Solution
+from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.identifiability import identifiability_of, parameter_names
+from calibrate.observations import RejectedShot
+from calibrate.result import Calibration, ShotResult, Statistics
+from calibrate.result_file import calibration_data
+from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
+from calibrate.verdict import Evidence, judge
+from drivers.files.session import Session
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
+
+if TYPE_CHECKING:
+    from calibrate.solve import Solved
+
+
+def make_result(
+    solved: Solved,
+    *,
+    cell: Cell,
+    sessions: Sequence[Session],
+    n_shots: int,
+    notes: tuple[str, ...],
+    compared: Mapping[str, float],
+    rejected: tuple[RejectedShot, ...],
+    created_utc: str,
+    software: str,
+    began: float,
+) -> Calibration:
+    """The calibration of a solve, with everything that a file must hold."""
+    assembled, solution, problem = solved.assembled, solved.solution, solved.assembled.problem
+    state = solution.state
+    has_joints = problem.model is not None and problem.joints_rad is not None
+    datum = controller_datum()
+    if problem.model is not None and problem.joints_rad is not None:
+        datum = nominal_robot_datum(problem.model, state.link_twists, problem.joints_rad)
+    trained = predict(problem, state)
+    line_profile = not problem.along_sight
+    held_out_rms = solved.held_out.radial_rms_mm if line_profile else solved.held_out.centre_rms_mm
+    predicted_rms = None if line_profile else _predicted_centre_rms(assembled, solution)
+    scale = 1.0 if predicted_rms is None else max(1.0, (held_out_rms / predicted_rms) ** 2)
+    identifiability = identifiability_of(problem, solution)
+    names = assembled.sphere_names
+    covariance = solution.covariance * scale
+    verdict, reasons = judge(
+        Evidence(
+            limits=cell.limits,
+            cross_validated_rms_mm=held_out_rms,
+            length_expanded_uncertainty_mm=_longest_length_uncertainty(assembled, solution, covariance),
+            n_shots=n_shots,
+            used=problem.n_shots,
+            has_joints=has_joints,
+            has_certified_length=bool(problem.lengths),
+            line_profile=line_profile,
+            covariance_scale=scale,
+        ),
+        identifiability,
+    )
+    result = Calibration(
+        id="",
+        method="clouds",
+        model=problem.model if has_joints else None,
+        link_twists=state.link_twists,
+        flange_from_camera=state.flange_from_camera,
+        camera_error=problem.camera_error,
+        camera_mm=state.camera_mm,
+        camera_seen_volume_mm=np.array([problem.points_in_camera_mm.min(axis=0), problem.points_in_camera_mm.max(axis=0)]),
+        radius_offset_mm=state.radius_offset_mm,
+        sphere_centres_in_base_mm={name: se3.apply(datum.base_from_solver, c) for name, c in zip(names, state.centres_in_base_mm, strict=True)},
+        sphere_radius_offsets_mm={name: state.radius_offset_mm + float(d) for name, d in zip(names, state.sphere_radius_deviation_mm, strict=True)},
+        datum=datum,
+        seen_joints_rad=None if problem.joints_rad is None else np.array([problem.joints_rad.min(axis=0), problem.joints_rad.max(axis=0)]),
+        noise=solution.noise,
+        parameter_names=parameter_names(problem.layout, names),
+        covariance=covariance,
+        statistics=Statistics(
+            n_shots=n_shots,
+            used=problem.n_shots,
+            rank=identifiability.rank,
+            n_parameters=identifiability.n_parameters,
+            condition=identifiability.condition,
+            train_rms_mm=trained.radial_rms_mm,
+            cross_validated_rms_mm=held_out_rms,
+            predicted_centre_rms_mm=predicted_rms,
+            covariance_scale=scale,
+            passes=solution.passes,
+            seconds=time.perf_counter() - began,
+            compared=compared,
+        ),
+        limits=cell.limits,
+        verdict=verdict,
+        reasons=reasons + notes,
+        shots=_shot_results(assembled, solution, trained, solved.held_out, datum.base_from_solver),
+        rejected=rejected,
+        cell_name=cell.name,
+        inputs={"sessions": [{"folder": s.folder.name, "digest": s.digest} for s in sessions], "cell_sha256": cell.sha256},
+        identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
+        created_utc=created_utc,
+        software=software,
+    )
+    return replace(result, id=str(calibration_data(result)["id"]))
+
+
+def _predicted_centre_rms(assembled: Assembled, solution: Solution) -> float:
+    """First-order rms of the distance between a shot's own centre and its sphere's: parameters, pose noise and points."""
+    problem = assembled.problem
+    covariance, sensitivity = shot_centre_covariance_mm2(problem, solution)
+    spread = sensitivity @ solution.covariance @ np.swapaxes(sensitivity, -1, -2)
+    return float(np.sqrt(np.trace(covariance + spread, axis1=1, axis2=2).mean()))
+
+
+def _longest_length_uncertainty(assembled: Assembled, solution: Solution, covariance: FloatArray) -> float | None:
+    """Expanded uncertainty (k = 2) of the distance between the two farthest sphere places, seen from new poses."""
+    problem, centres = assembled.problem, solution.state.centres_in_base_mm
+    pairs = list(combinations(range(len(centres)), 2))
+    if not pairs:
+        return None
+    first, second = max(pairs, key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))
+    _, sensitivity = shot_centre_covariance_mm2(problem, solution)
+    sensitivity = sensitivity.copy()
+    sensitivity[:, :, problem.layout.centres] = 0.0
+    mean = [sensitivity[problem.sphere == s].mean(axis=0) for s in (first, second)]
+    direction = (centres[second] - centres[first]) / np.linalg.norm(centres[second] - centres[first])
+    row = direction @ (mean[1] - mean[0])
+    return float(2.0 * np.sqrt(row @ covariance @ row))
+
+
+def _shot_results(
+    assembled: Assembled, solution: Solution, trained: Prediction, held_out: Prediction, base_from_solver: FloatArray
+) -> tuple[ShotResult, ...]:
+    problem = assembled.problem
+    line_profile = not problem.along_sight
+    in_base = se3.apply(base_from_solver, trained.centres_in_base_mm)
+    radial = np.sqrt(trained.sum_of_squares_mm2 / trained.n_points)
+    errors = np.full(problem.n_shots, np.nan)
+    if len(held_out.n_points) == problem.n_shots:
+        errors = np.sqrt(held_out.sum_of_squares_mm2 / held_out.n_points) if line_profile else np.linalg.norm(held_out.centre_error_mm, axis=1)
+    return tuple(
+        ShotResult(
+            session=shot.session,
+            index=shot.index,
+            sphere=shot.sphere,
+            scan_sha256=shot.scan_sha256,
+            n_points=len(shot.points_in_camera_mm),
+            point_rms_mm=float(solution.point_rms_mm[i]),
+            radial_rms_mm=float(radial[i]),
+            centre_in_camera_mm=solution.geometry.centre_in_camera_mm[i],
+            centre_in_base_mm=None if line_profile else in_base[i],
+            predicted_error_mm=None if np.isnan(errors[i]) else float(errors[i]),
+        )
+        for i, shot in enumerate(assembled.shots)
+    )

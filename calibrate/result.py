@@ -1,0 +1,275 @@
+"""The result of a calibration: whole in itself, immutable, and what it is used for.
+
+calibration = Calibration.load("calibration.yaml")
+calibration.points_in_base_mm(points_in_camera_mm, joints_rad=q)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from acquire.cell import Limits
+from calibrate.camera_error import CameraError, correction_in_camera_mm
+from calibrate.datum import Datum, datum_jacobian, link_columns, twist_columns
+from calibrate.normal import NoiseModel
+from calibrate.observations import RejectedShot
+from drivers.errors import SettingsError
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
+
+_CHUNK = 50_000
+_MEAN_SQUARE_COSINE = 7.0 / 12.0
+"""Of the incidence over a cap of 60 degrees: turns noise along the normal into noise along the sight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShotResult:
+    """One shot that the calibration was made from."""
+
+    session: str
+    index: int
+    sphere: str
+    scan_sha256: str
+    n_points: int
+    point_rms_mm: float
+    """Radial rms with the shot's own pose noise taken out."""
+    radial_rms_mm: float
+    """Radial rms as it is."""
+    centre_in_camera_mm: FloatArray
+    """(3,) where the sphere was in the camera frame."""
+    centre_in_base_mm: FloatArray | None
+    """(3,) fixed-radius centre of this shot alone, calibrated; None for a line profile."""
+    predicted_error_mm: float | None
+    """Distance of the centre from where a solve without this shot expects it (line profiles: radial rms)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What a solve says of itself."""
+
+    n_shots: int
+    used: int
+    rank: int
+    n_parameters: int
+    condition: float
+    train_rms_mm: float
+    cross_validated_rms_mm: float
+    predicted_centre_rms_mm: float | None
+    """First-order prediction of `cross_validated_rms_mm`, from the covariance and the noise alone."""
+    covariance_scale: float
+    """What the covariance was multiplied by so that it explains the held-out shots."""
+    passes: int
+    seconds: float
+    compared: Mapping[str, float] = field(default_factory=dict)
+    """Held-out rms of every camera error model that was tried, mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Robot, hand-eye and camera, calibrated together."""
+
+    id: str
+    method: str
+    model: RobotModel | None
+    """Nominal robot, or None for a pose-only calibration."""
+    link_twists: FloatArray
+    """(n, 6)."""
+    flange_from_camera: FloatArray
+    camera_error: CameraError
+    camera_mm: FloatArray
+    """(k,) coefficients of the camera error model."""
+    camera_seen_volume_mm: FloatArray
+    """(2, 3) lower and upper corner of the part of the camera frame in which points were seen."""
+    radius_offset_mm: float
+    sphere_centres_in_base_mm: Mapping[str, FloatArray]
+    sphere_radius_offsets_mm: Mapping[str, float]
+    """Shared offset plus the sphere's own deviation within its certificate."""
+    datum: Datum
+    seen_joints_rad: FloatArray | None
+    """(2, n) least and greatest axis angles used."""
+    noise: NoiseModel
+    parameter_names: tuple[str, ...]
+    covariance: FloatArray
+    """(P, P) of `parameter_names`, solver base, already scaled on held-out shots."""
+    statistics: Statistics
+    limits: Limits | None
+    verdict: str
+    reasons: tuple[str, ...]
+    shots: tuple[ShotResult, ...]
+    rejected: tuple[RejectedShot, ...]
+    cell_name: str
+    inputs: Mapping[str, object]
+    identity: Mapping[str, object]
+    created_utc: str
+    software: str
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read calibration.yaml; FileError when it is broken or was changed by hand."""
+        from calibrate.result_file import load_calibration
+
+        return load_calibration(path, cls)
+
+    def save(self, path: str | Path) -> None:
+        """Write calibration.yaml, atomically."""
+        from calibrate.result_file import save_calibration
+
+        save_calibration(self, path)
+
+    def base_from_flange(self, joints_rad: ArrayLike) -> FloatArray:
+        """Corrected robot (..., 4, 4) for axis angles (..., n); SettingsError for a pose-only calibration."""
+        if self.model is None:
+            raise SettingsError(
+                "this calibration holds no robot model: it was made from flange poses", remedy="Pass base_from_flange= instead of joints_rad=."
+            )
+        q = np.asarray(joints_rad, dtype=np.float64)
+        if q.shape[-1:] != (self.model.n_joints,) or not np.isfinite(q).all():
+            raise SettingsError(f"joints_rad must be finite, of shape (..., {self.model.n_joints}), not {q.shape}", remedy="Pass axis angles in rad.")
+        return self.datum.base_from_solver @ mdh.base_from_flange(self.model, q, self.link_twists)
+
+    def corrected_points_in_camera_mm(self, points_in_camera_mm: ArrayLike) -> FloatArray:
+        """Points (n, 3) with the camera's error taken out, still in the camera frame; NaN rows stay NaN."""
+        points = _points(points_in_camera_mm)
+        if not len(self.camera_mm):
+            return points.copy()
+        return points + correction_in_camera_mm(self.camera_error, self.camera_mm, points)
+
+    def points_in_base_mm(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        """Measured points (n, 3) in the base.
+
+        Args:
+            points_in_camera_mm: (n, 3) as the camera gave them; NaN rows stay NaN.
+            joints_rad: (n_axes,), or (n, n_axes) with one row a point; for calibrations of the whole robot.
+            base_from_flange: (4, 4); for pose-only calibrations.
+
+        Raises:
+            SettingsError: not exactly the one of the two that fits this calibration, or a wrong shape.
+        """
+        corrected = self.corrected_points_in_camera_mm(points_in_camera_mm)
+        flange = self._flange(joints_rad, base_from_flange, len(corrected))
+        base_from_camera = flange @ self.flange_from_camera
+        if base_from_camera.ndim == 2:
+            return np.asarray(corrected @ base_from_camera[:3, :3].T + base_from_camera[:3, 3])
+        return se3.apply(base_from_camera, corrected)
+
+    def point_covariance_in_base_mm2(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        """Covariance (n, 3, 3) of `points_in_base_mm`: calibration, pose noise of the shot, and noise of the point.
+
+        First order; points of one shot share its pose noise and all points share the calibration, so differences are
+        better known than two covariances taken as independent would say. Raises as `points_in_base_mm`.
+        """
+        points = _points(points_in_camera_mm)
+        result = np.full((len(points), 3, 3), np.nan)
+        for start in range(0, len(points), _CHUNK):
+            chunk = slice(start, start + _CHUNK)
+            q = _chunk_of(joints_rad, chunk, len(points))
+            jacobian = self.point_jacobian(points[chunk], joints_rad=q, base_from_flange=base_from_flange)
+            used = self.covariance[: jacobian.shape[-1], : jacobian.shape[-1]]
+            result[chunk] = jacobian @ used @ np.swapaxes(jacobian, -1, -2) + self._shot_covariance(points[chunk], q, base_from_flange)
+        return result
+
+    def point_jacobian(
+        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
+    ) -> FloatArray:
+        """(n, 3, p) motion of points in the stated base per parameter of robot, hand-eye and camera (the first p)."""
+        points = _points(points_in_camera_mm)
+        flange = np.broadcast_to(self._solver_flange(joints_rad, base_from_flange, len(points)), (len(points), 4, 4))
+        base_from_camera = flange @ self.flange_from_camera
+        in_solver_base = se3.apply(base_from_camera, self.corrected_points_in_camera_mm(points))
+        blocks = []
+        if self.model is not None:
+            q = np.broadcast_to(np.asarray(joints_rad, dtype=np.float64), (len(points), self.model.n_joints))
+            frames = mdh.chain(self.model, q, self.link_twists)
+            moved = link_columns(self.model, q, frames, self.link_twists, in_solver_base)
+            rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
+            blocks.append(moved + rigid @ datum_jacobian(self.datum, self.model, self.link_twists))
+        blocks.append(twist_columns(flange, in_solver_base))
+        basis = self.camera_error.basis(points)
+        blocks.append(base_from_camera[:, :3, :3][:, :, self.camera_error.axis] * basis[:, None, :])
+        return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
+
+    def to_json_dict(self) -> dict[str, object]:
+        """What `spherecal calibrate --json` prints."""
+        s = self.statistics
+        return {
+            "id": self.id,
+            "method": self.method,
+            "camera_error": self.camera_error.name,
+            "n_shots": s.n_shots,
+            "used": s.used,
+            "rejected": [{"session": r.session, "index": r.index, "reason": r.reason} for r in self.rejected],
+            "rank": s.rank,
+            "n_parameters": s.n_parameters,
+            "train_rms_mm": s.train_rms_mm,
+            "cross_validated_rms_mm": s.cross_validated_rms_mm,
+            "predicted_centre_rms_mm": s.predicted_centre_rms_mm,
+            "radius_offset_mm": self.radius_offset_mm,
+            "noise": {"point_mm": self.noise.point_mm, "form_mm": self.noise.form_mm, "pose_mm": self.noise.pose_mm, "pose_rad": self.noise.pose_rad},
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "seconds": s.seconds,
+        }
+
+    def _shot_covariance(self, points: FloatArray, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None) -> FloatArray:
+        flange = np.broadcast_to(self._flange(joints_rad, base_from_flange, len(points)), (len(points), 4, 4))
+        base_from_camera = flange @ self.flange_from_camera
+        lever = se3.hat(se3.apply(base_from_camera, points) - flange[:, :3, 3])
+        pose = self.noise.pose_mm**2 * np.eye(3) + self.noise.pose_rad**2 * lever @ np.swapaxes(lever, -1, -2)
+        sight = np.einsum("nij,nj->ni", base_from_camera[:, :3, :3], points / np.linalg.norm(points, axis=1, keepdims=True))
+        along = (self.noise.point_mm**2 + self.noise.form_mm**2) / _MEAN_SQUARE_COSINE
+        return np.asarray(pose + along * sight[:, :, None] * sight[:, None, :])
+
+    def _flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:
+        return self.datum.base_from_solver @ self._solver_flange(joints_rad, base_from_flange, n_points)
+
+    def _solver_flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:
+        if (joints_rad is None) == (base_from_flange is None):
+            raise SettingsError("give exactly one of joints_rad and base_from_flange", remedy=self._wanted())
+        if base_from_flange is not None:
+            return self._given_pose(base_from_flange)
+        q = np.asarray(joints_rad, dtype=np.float64)
+        if self.model is None:
+            raise SettingsError("joints_rad does not fit a pose-only calibration", remedy=self._wanted())
+        if q.shape not in {(self.model.n_joints,), (n_points, self.model.n_joints)} or not np.isfinite(q).all():
+            raise SettingsError(
+                f"joints_rad of shape {q.shape} does not fit {n_points} points of this robot, or is not finite", remedy=self._wanted()
+            )
+        return mdh.base_from_flange(self.model, q, self.link_twists)
+
+    def _given_pose(self, base_from_flange: ArrayLike) -> FloatArray:
+        pose = np.asarray(base_from_flange, dtype=np.float64)
+        if self.model is not None:
+            raise SettingsError("base_from_flange does not fit a calibration of the whole robot", remedy=self._wanted())
+        if not se3.is_rigid(pose, 1e-4):
+            raise SettingsError("base_from_flange is no rigid transform of shape (4, 4)", remedy="Pass a rotation and a translation in mm.")
+        return pose
+
+    def _wanted(self) -> str:
+        if self.model is None:
+            return "This calibration takes base_from_flange of shape (4, 4)."
+        return f"This calibration takes joints_rad of shape ({self.model.n_joints},) or (n, {self.model.n_joints}), in rad."
+
+
+def _points(points_in_camera_mm: ArrayLike) -> FloatArray:
+    points = np.asarray(points_in_camera_mm, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise SettingsError(f"points must be of shape (n, 3), not {points.shape}", remedy="Reshape organised clouds: cloud.reshape(-1, 3).")
+    return points
+
+
+def _chunk_of(joints_rad: ArrayLike | None, chunk: slice, n_points: int) -> FloatArray | None:
+    if joints_rad is None:
+        return None
+    q = np.asarray(joints_rad, dtype=np.float64)
+    return q[chunk] if q.ndim == 2 and len(q) == n_points else q

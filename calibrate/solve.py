@@ -1,0 +1,247 @@
+"""From sessions to a calibration: the whole way, in the order a person would tell it."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acquire.cell import Cell, cell_of_session, robot_model_of
+from acquire.check import check_session
+from calibrate.assemble import Assembled, assemble, without_pose_noise
+from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
+from calibrate.clouds import Solution, solve_clouds
+from calibrate.normal import NoiseModel
+from calibrate.observations import Observations, RejectedShot, SphereShot, gather_observations
+from calibrate.plausibility import check_reported_poses
+from calibrate.problem import Priors, State
+from calibrate.report_figures import make_result
+from calibrate.result import Calibration
+from calibrate.start import start_from_centres
+from calibrate.start_arcs import start_from_arcs
+from calibrate.validation import Prediction, cross_validate, predict, shot_centre_covariance_mm2, squared_errors_mm2
+from drivers.errors import DataError
+from drivers.files.session import Session
+from drivers.kinematics.mdh import RobotModel
+
+_LOG = logging.getLogger(__name__)
+_DEFAULT_SIGHT_CROSSING_MM = (60.0, 0.0, 500.0)
+_AUTO = ("none", "affine", "pillow", "field")
+_THIN_POINTS = 250
+_REJECT_CHI2 = 30.7
+"""A clean shot exceeds this in one of a million cases (chi-square, three degrees of freedom)."""
+_MEDIAN_CHI2 = 2.366
+_REJECT_ROUNDS = 4
+_FIRST_NOISE = NoiseModel(point_mm=0.05, pose_mm=0.3, pose_rad=5e-4)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSettings:
+    """How to calibrate."""
+
+    camera_error: str = "auto"
+    """auto, none, affine, pillow or field."""
+    priors: Priors = field(default_factory=Priors)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A solve with its held-out shots."""
+
+    assembled: Assembled
+    solution: Solution
+    held_out: Prediction
+    rejected: tuple[RejectedShot, ...]
+
+
+def calibrate(sessions: Sequence[Session], settings: CalibrationSettings | None = None) -> Calibration:
+    """Calibrate robot, hand-eye and camera on one or more sessions of one cell.
+
+    Raises:
+        FileError: a file is broken, or a shot does not fit the cell.
+        DataError: the data cannot be used: no sphere found, too few shots, wrong units, no solution.
+        SettingsError: an unknown camera error model.
+    """
+    from threadpoolctl import threadpool_limits
+
+    # thousands of products of small matrices: threads in BLAS cost ten times what they save, and reorder sums
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _calibrate(sessions, settings or CalibrationSettings())
+
+
+def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Calibration:
+    began = time.perf_counter()
+    cell, model = cell_of_sessions(sessions)
+    notes = check_reported_poses(sessions, model)
+    observations = gather_observations(sessions, cell=cell, model=model)
+    if not observations.shots:
+        raise _nothing_to_use(sessions, observations)
+    solved, compared = solve_observations(observations, cell, model, settings)
+    return make_result(
+        solved,
+        cell=cell,
+        sessions=sessions,
+        n_shots=observations.n_shots,
+        notes=notes,
+        compared=compared,
+        rejected=observations.rejected + solved.rejected,
+        created_utc=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        software=f"spherecal {importlib.metadata.version('spherecal')}",
+        began=began,
+    )
+
+
+def cell_of_sessions(sessions: Sequence[Session]) -> tuple[Cell, RobotModel | None]:
+    """The one cell and robot of some sessions; DataError where two of them describe different ones."""
+    if not sessions:
+        raise DataError("no session given", remedy="Name at least one session folder.")
+    digests = [session.digest for session in sessions]
+    if len(set(digests)) < len(digests):
+        raise DataError("the same session was given twice", remedy="Name every session once.")
+    cell = cell_of_session(sessions[0])
+    model = robot_model_of(cell, sessions[0])
+    for session in sessions:
+        other = cell_of_session(session)
+        if (other.spheres, other.lengths, other.robot.model) != (cell.spheres, cell.lengths, cell.robot.model):
+            raise DataError(
+                "its spheres, lengths or robot differ from those of the first session",
+                file=session.cell_path,
+                remedy="Calibrate sessions of different cells apart, or give moved spheres their own names in one cell file.",
+            )
+        check_session(session, other, robot_model_of(other, session))
+    return cell, model
+
+
+def solve_observations(
+    observations: Observations, cell: Cell, model: RobotModel | None, settings: CalibrationSettings
+) -> tuple[Solved, dict[str, float]]:
+    """Solve with the camera error model asked for, or with the simplest that held-out shots do not tell from the best."""
+    models = _candidates(observations, cell, settings)
+    first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
+    start, keep, rejected = _start(first, cell)
+    if len(models) == 1:
+        return _solve_and_reject(first, start, keep, rejected), {}
+    keep = _kept_after_solve(first, start, keep)
+    thin = _thinned(first)
+    tried = [_solve(thin.subset(keep, model_), _for_model(start, model_)) for model_ in models]
+    chosen = _simplest_of_the_best(tried)
+    compared = {t.assembled.problem.camera_error.name: _held_out_rms(t) for t in tried}
+    _LOG.debug("held-out rms by camera error model: %s", compared)
+    state = without_pose_noise(tried[chosen].solution.state, first.problem.n_scans)
+    everything = first.subset(np.arange(first.problem.n_shots), models[chosen])
+    return _solve_and_reject(everything, state, keep, rejected), compared
+
+
+def _candidates(observations: Observations, cell: Cell, settings: CalibrationSettings) -> list[CameraError]:
+    if cell.camera.kind == "line_profile" and settings.camera_error == "auto":
+        return [NoCameraError()]
+    names = _AUTO if settings.camera_error == "auto" else (settings.camera_error,)
+    points = np.concatenate([shot.points_in_camera_mm for shot in observations.shots])
+    crossing = cell.camera.sight_crossing_mm or _DEFAULT_SIGHT_CROSSING_MM
+    return camera_error_models(names, points_in_camera_mm=points, sight_crossing_mm=crossing)
+
+
+def _start(assembled: Assembled, cell: Cell) -> tuple[State, NDArray[np.int64], tuple[RejectedShot, ...]]:
+    """First guess, the shots that fit it, and those that do not."""
+    problem, shots = assembled.problem, assembled.shots
+    if not problem.along_sight:
+        return start_from_arcs(problem, cell.flange_from_camera).state, np.arange(len(shots)), ()
+    centres = np.array([shot.centre_in_camera_mm for shot in shots], dtype=np.float64)
+    start = start_from_centres(problem, centres, cell.flange_from_camera)
+    rejected = tuple(_too_far(shots[i], start.miss_mm[i]) for i in np.flatnonzero(start.spoiled))
+    return start.state, np.flatnonzero(~start.spoiled), rejected
+
+
+def _solve(assembled: Assembled, start: State) -> Solved:
+    state = without_pose_noise(start, assembled.problem.n_scans)
+    solution = solve_clouds(assembled.problem, state, _FIRST_NOISE)
+    return Solved(assembled, solution, cross_validate(solution), ())
+
+
+def _solve_and_reject(everything: Assembled, start: State, keep: NDArray[np.int64], rejected: tuple[RejectedShot, ...]) -> Solved:
+    """Solve, reject the shots that the noise cannot explain, and solve again until none is left."""
+    for _ in range(_REJECT_ROUNDS):
+        part = everything.subset(keep)
+        solution = solve_clouds(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
+        far, miss_mm = _unexplained(part, solution)
+        if not far.any():
+            break
+        rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))
+        keep, start = keep[~far], solution.state
+    return Solved(part, solution, cross_validate(solution), rejected)
+
+
+def _kept_after_solve(everything: Assembled, start: State, keep: NDArray[np.int64]) -> NDArray[np.int64]:
+    thin = _thinned(everything)
+    for _ in range(_REJECT_ROUNDS):
+        part = thin.subset(keep)
+        solution = solve_clouds(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
+        far, _ = _unexplained(part, solution)
+        if not far.any():
+            break
+        keep = keep[~far]
+    return keep
+
+
+def _unexplained(assembled: Assembled, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """(m,) shots further off than noise, pose noise and the typical shot explain, and by how much (mm)."""
+    problem = assembled.problem
+    if not problem.along_sight:
+        return np.zeros(problem.n_shots, dtype=bool), np.zeros(problem.n_shots)
+    miss = predict(problem, solution.state).centre_error_mm
+    covariance, _ = shot_centre_covariance_mm2(problem, solution)
+    chi2 = np.einsum("mi,mi->m", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
+    typical = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
+    return np.asarray(chi2 > _REJECT_CHI2 * typical), np.linalg.norm(miss, axis=1)
+
+
+def _thinned(assembled: Assembled) -> Assembled:
+    """At most some hundred points a shot, evenly through it: enough to compare models."""
+    shots = tuple(
+        replace(s, points_in_camera_mm=s.points_in_camera_mm[:: max(1, len(s.points_in_camera_mm) // _THIN_POINTS)]) for s in assembled.shots
+    )
+    problem = assembled.problem
+    points = np.concatenate([shot.points_in_camera_mm for shot in shots])
+    starts = np.concatenate([[0], np.cumsum([len(s.points_in_camera_mm) for s in shots])]).astype(np.int64)
+    thin = replace(problem, points_in_camera_mm=points, starts=starts, basis=problem.camera_error.basis(points))
+    return Assembled(thin, shots, assembled.sphere_names)
+
+
+def _for_model(state: State, camera_error: CameraError) -> State:
+    return replace(state, camera_mm=np.zeros(len(camera_error.axis)))
+
+
+def _simplest_of_the_best(tried: Sequence[Solved]) -> int:
+    """The first model whose held-out error is within one standard error (of the difference) of the best."""
+    errors = [squared_errors_mm2(t.held_out) for t in tried]
+    best = int(np.argmin([error.mean() for error in errors]))
+    for i, error in enumerate(errors):
+        difference = error - errors[best]
+        if difference.mean() <= difference.std(ddof=1) / np.sqrt(len(difference)):
+            return i
+    return best
+
+
+def _held_out_rms(solved: Solved) -> float:
+    return float(np.sqrt(squared_errors_mm2(solved.held_out).mean()))
+
+
+def _too_far(shot: SphereShot, miss_mm: float) -> RejectedShot:
+    return RejectedShot(shot.session, shot.index, f"outlier: its sphere {shot.sphere} lies {miss_mm:.2f} mm from where the other shots put it")
+
+
+def _nothing_to_use(sessions: Sequence[Session], observations: Observations) -> DataError:
+    if not observations.rejected:
+        return DataError("the session holds no shot of a sphere", file=sessions[0].folder / "shots.jsonl", remedy="Capture shots first.")
+    first = observations.rejected[0]
+    return DataError(
+        f"none of {observations.n_shots} shots shows its sphere; shot {first.index}: {first.reason}",
+        file=sessions[0].folder,
+        remedy="`spherecal centres` shows each shot; check units, diameters and which sphere each shot names.",
+    )

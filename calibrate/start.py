@@ -1,0 +1,160 @@
+"""A first guess that the whole-cloud solve can start from: from sphere centres (area cameras) or from arcs.
+
+Centres: the hand-eye transform and all centres come from one linear system, robustly (METHOD.md 4, *First guess*); then
+every unknown is refined on centres with a redescending weight per shot, which shows the shots that do not belong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate import normal
+from calibrate.normal import NoiseModel
+from calibrate.problem import Problem, State, linearise_geometry
+from drivers.errors import DataError
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
+
+_ROUNDS = 30
+_SMALLEST_SCALE_MM = 0.05
+_REJECT_SCALES = 8.0
+_REJECT_AT_LEAST_MM = 1.0
+_FITS_MM = 30.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A state near the solution and how far each shot's centre is from it."""
+
+    state: State
+    miss_mm: FloatArray
+    """(m,) distance of each shot's own centre from where the state expects it; zeros for line profiles."""
+    scale_mm: float
+    """Robust sigma of one component of the misses."""
+
+    @property
+    def spoiled(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+        """(m,) shots that lie further off than anything a good shot could."""
+        return np.asarray(self.miss_mm > max(_REJECT_SCALES * self.scale_mm, _REJECT_AT_LEAST_MM))
+
+
+def start_from_centres(problem: Problem, centres_in_camera_mm: FloatArray, guess: FloatArray | None) -> Start:
+    """Start for shots with a centre (m, 3) each; `guess` is a flange_from_camera (4, 4) or None.
+
+    The guess and the linear solution are both refined, and the one that explains the shots better is taken.
+
+    Raises:
+        DataError: neither brings most shots within some centimetres of one place: the data do not belong together.
+    """
+    hand_eyes = [] if guess is None else [guess]
+    linear = _linear_hand_eye(problem, centres_in_camera_mm)
+    if linear is not None:
+        hand_eyes.append(linear)
+    if not hand_eyes:
+        raise DataError("too few shots for a first guess of the hand-eye transform", remedy="Take at least 12 shots from different orientations.")
+    starts = [_refine(problem, centres_in_camera_mm, hand_eye) for hand_eye in hand_eyes]
+    best = min(starts, key=lambda s: s.scale_mm)
+    if not best.scale_mm < _FITS_MM:
+        raise DataError(
+            f"no hand-eye transform brings the shots of a sphere to one place (they stay {best.scale_mm:.0f} mm apart)",
+            remedy="Check the robot model (coupling, axis order, degrees), the units of the scans, and that the sphere stood still.",
+        )
+    return best
+
+
+def initial_state(problem: Problem, flange_from_camera: FloatArray, centres_in_base_mm: FloatArray) -> State:
+    """A state with every error at zero."""
+    layout = problem.layout
+    return State(
+        link_twists=np.zeros((layout.n_links, 6)),
+        flange_from_camera=flange_from_camera,
+        camera_mm=np.zeros(layout.n_camera),
+        radius_offset_mm=0.0,
+        sphere_radius_deviation_mm=np.zeros(layout.n_spheres),
+        centres_in_base_mm=centres_in_base_mm,
+        pose_noise=np.zeros((problem.n_scans, 6)),
+    )
+
+
+def centres_by_median(problem: Problem, flange_from_camera: FloatArray, centres_in_camera_mm: FloatArray) -> FloatArray:
+    """(S, 3) medians over shots of where each sphere would be in the base."""
+    in_base = se3.apply(problem.base_from_flange @ flange_from_camera, centres_in_camera_mm)
+    return np.array([np.median(in_base[problem.sphere == s], axis=0) for s in range(len(problem.radius_mm))])
+
+
+def _linear_hand_eye(problem: Problem, centres: FloatArray) -> FloatArray | None:
+    """Solve R_j R_X p_j + R_j t_X - c_s = -t_j for R_X (9), t_X, c_s by reweighted least squares, then project R_X."""
+    rotation, translation = problem.base_from_flange[:, :3, :3], problem.base_from_flange[:, :3, 3]
+    m, n_spheres = problem.n_shots, len(problem.radius_mm)
+    if 3 * m < 12 + 3 * n_spheres + 3:
+        return None
+    columns = np.zeros((m, 3, 12 + 3 * n_spheres))
+    columns[:, :, :9] = (rotation[:, :, :, None] * centres[:, None, None, :]).reshape(m, 3, 9)
+    columns[:, :, 9:12] = rotation
+    columns[np.arange(m)[:, None], np.arange(3)[None], 12 + 3 * problem.sphere[:, None] + np.arange(3)[None]] = -1.0
+    weight = np.ones(m)
+    scale_columns = np.concatenate([np.full(9, 300.0), np.ones(3 + 3 * n_spheres)])
+    for _ in range(12):
+        root = np.sqrt(weight)[:, None, None]
+        solution = np.linalg.lstsq(
+            (columns * root / scale_columns).reshape(-1, 12 + 3 * n_spheres), -(translation[..., None] * root).reshape(-1), rcond=1e-10
+        )[0]
+        unknowns = solution / scale_columns
+        miss = np.linalg.norm(columns @ unknowns + translation, axis=1)
+        weight = _weights(miss, max(1.4826 * float(np.median(miss)) / 1.54, 1e-3))
+    matrix = unknowns[:9].reshape(3, 3)
+    if not np.isfinite(matrix).all() or np.linalg.det(matrix) <= 0:
+        return None
+    return se3.from_rotation_translation(se3.nearest_rotation(matrix), unknowns[9:12])
+
+
+def _refine(problem: Problem, centres: FloatArray, hand_eye: FloatArray) -> Start:
+    """Gauss-Newton on centres, a weight per shot; first the hand-eye transform and centres, then everything."""
+    state = initial_state(problem, hand_eye, centres_by_median(problem, hand_eye, centres))
+    weight, scale, miss = np.ones(problem.n_shots), np.inf, np.zeros(problem.n_shots)
+    for turn in range(_ROUNDS):
+        geometry = linearise_geometry(problem, state)
+        camera_shift = _basis_at(problem, centres)
+        corrected = centres + np.einsum("mki,k->mi", camera_shift, state.camera_mm)
+        difference = corrected - geometry.centre_in_camera_mm
+        miss = np.linalg.norm(difference, axis=1)
+        # the median length of a 3-vector of unit noise is 1.54
+        scale = max(float(np.median(miss)) / 1.54, _SMALLEST_SCALE_MM)
+        weight = _weights(miss, scale)
+        moments = _centre_moments(difference, camera_shift, weight)
+        linearised = normal.linearise(problem, state, geometry, moments, np.full(problem.n_shots, scale**-2.0))
+        held = NoiseModel(scale, 1e-6, 1e-9)
+        reduced = normal.reduce(linearised, held.pose_precision)
+        if turn < _ROUNDS // 3:
+            free = np.zeros(problem.layout.size, dtype=bool)
+            free[problem.layout.hand_eye] = free[problem.layout.centres] = True
+            step = np.zeros(problem.layout.size)
+            step[free] = -normal.symmetric_solve(reduced.hessian[np.ix_(free, free)], reduced.gradient[free])
+        else:
+            step = -normal.symmetric_solve(reduced.hessian, reduced.gradient)
+        state = state.moved(problem.layout, step, np.zeros_like(state.pose_noise))
+    return Start(state, miss, scale)
+
+
+def _weights(miss_mm: FloatArray, scale_mm: float) -> FloatArray:
+    return np.asarray((1.0 + (miss_mm / (4.0 * scale_mm)) ** 2) ** -2.0)
+
+
+def _basis_at(problem: Problem, centres: FloatArray) -> FloatArray:
+    """(m, k, 3): motion of a point at the centre per camera coefficient."""
+    values = problem.camera_error.basis(centres)
+    result = np.zeros((*values.shape, 3))
+    result[:, np.arange(values.shape[1]), problem.camera_error.axis] = values
+    return result
+
+
+def _centre_moments(difference: FloatArray, camera_shift: FloatArray, weight: FloatArray) -> FloatArray:
+    """Moment matrices as of points that know their centre in all three directions and nothing of the radius."""
+    m, k = camera_shift.shape[:2]
+    rows = np.zeros((m, 3, k + 5))
+    rows[:, :, :3] = np.eye(3)
+    rows[:, :, 3 : 3 + k] = np.swapaxes(camera_shift, 1, 2)
+    rows[:, :, -1] = difference
+    return np.asarray(np.swapaxes(rows, 1, 2) @ rows * weight[:, None, None])

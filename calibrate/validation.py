@@ -1,0 +1,139 @@
+"""How well shots are predicted by a solve that never saw them: k folds over scans (METHOD.md 4, *Never certify*)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.assemble import subset, without_pose_noise
+from calibrate.clouds import Solution, rebased, shot_moments, solve_clouds
+from calibrate.problem import Geometry, Problem, State, linearise_geometry
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
+
+N_FOLDS = 10
+_FOLD_TOLERANCE_MM = 1e-4
+_CENTRE_ROUNDS = 6
+_LEAVE_ONE_OUT_BELOW = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What other shots look like to a solved state; m shots, no pose noise taken out."""
+
+    centre_error_mm: FloatArray
+    """(m, 3) own fixed-radius centre minus the sphere's, base axes; NaN for line profiles."""
+    centres_in_base_mm: FloatArray
+    """(m, 3); NaN for line profiles."""
+    sum_of_squares_mm2: FloatArray
+    """(m,) of the radial residuals."""
+    n_points: FloatArray
+    """(m,)."""
+
+    @property
+    def centre_rms_mm(self) -> float:
+        """Root of the mean squared distance of the shots' centres from their sphere's."""
+        return float(np.sqrt((self.centre_error_mm**2).sum(axis=1).mean()))
+
+    @property
+    def radial_rms_mm(self) -> float:
+        """Over all points, each point equal."""
+        return float(np.sqrt(self.sum_of_squares_mm2.sum() / self.n_points.sum()))
+
+
+def predict(problem: Problem, state: State) -> Prediction:
+    """Look at the shots of a problem with a state that another set of shots gave."""
+    state = without_pose_noise(state, problem.n_scans)
+    geometry = linearise_geometry(problem, state)
+    problem = rebased(problem, state, geometry)
+    _, counts = shot_moments(problem, state, geometry, np.inf)
+    error = np.full((problem.n_shots, 3), np.nan)
+    centres = error.copy()
+    if problem.along_sight:
+        centres = shot_centres_in_base_mm(problem, state, geometry)
+        error = centres - state.centres_in_base_mm[problem.sphere]
+    return Prediction(error, centres, counts[:, 1], counts[:, 2])
+
+
+def shot_centres_in_base_mm(problem: Problem, state: State, geometry: Geometry) -> FloatArray:
+    """(m, 3) fixed-radius centre of every shot's corrected points, each shot by itself."""
+    centres = geometry.centre_in_camera_mm
+    for _ in range(_CENTRE_ROUNDS):
+        moments, _ = shot_moments(problem, state, replace(geometry, centre_in_camera_mm=centres), np.inf)
+        # a cap that shows next to nothing of one direction must not throw its centre away
+        normal = moments[:, :3, :3] + 1e-9 * np.trace(moments[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        centres = centres + np.linalg.solve(normal, moments[:, :3, -1:])[..., 0]
+    return se3.apply(geometry.base_from_camera, centres)
+
+
+def cross_validate(solution: Solution, n_folds: int = N_FOLDS) -> Prediction:
+    """Every shot predicted by a solve without its fold; folds go by scan, and by pose where joints were repeated.
+
+    The noise model of the whole solve is kept; nothing else of it is.
+    """
+    problem = solution.problem
+    fold = folds_of(problem, n_folds)
+    error = np.zeros((problem.n_shots, 3))
+    centres, squares, n_points = error.copy(), np.zeros(problem.n_shots), np.zeros(problem.n_shots)
+    for k in range(int(fold.max()) + 1):
+        inside, outside = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
+        if not len(inside) or not set(problem.sphere[inside]) <= set(problem.sphere[outside]):
+            inside_seen = inside[np.isin(problem.sphere[inside], problem.sphere[outside])]
+            error[np.setdiff1d(inside, inside_seen)] = np.nan
+            inside = inside_seen
+        if not len(inside):
+            continue
+        training = subset(problem, outside)
+        start = without_pose_noise(solution.state, training.n_scans)
+        solved = solve_clouds(training, start, solution.noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM)
+        found = predict(subset(problem, inside), solved.state)
+        error[inside], centres[inside] = found.centre_error_mm, found.centres_in_base_mm
+        squares[inside], n_points[inside] = found.sum_of_squares_mm2, found.n_points
+    seen = n_points > 0
+    return Prediction(error[seen], centres[seen], squares[seen], n_points[seen])
+
+
+def folds_of(problem: Problem, n_folds: int) -> NDArray[np.int64]:
+    """(m,) fold of every shot, spread evenly over the spheres; depends on the set of shots and not on their order.
+
+    Shots of one scan, and shots taken at the same pose, stay together: they share their pose error.
+    """
+    pose = np.round(problem.base_from_flange[:, :3].reshape(problem.n_shots, 12), 6)
+    _, group = np.unique(pose, axis=0, return_inverse=True)
+    group = group.ravel()
+    n_groups = int(group.max()) + 1
+    n_folds = n_groups if n_groups < _LEAVE_ONE_OUT_BELOW else n_folds
+    first_sphere = np.array([problem.sphere[group == g].min() for g in range(n_groups)])
+    # groups are numbered by their pose, so a seeded shuffle of the numbers is the same for any order of the shots
+    shuffled = np.random.default_rng(20230825).permutation(n_groups)
+    order = shuffled[np.argsort(first_sphere[shuffled], kind="stable")]
+    fold_of_group = np.zeros(n_groups, dtype=np.int64)
+    fold_of_group[order] = np.arange(n_groups) % n_folds
+    return np.asarray(fold_of_group[group])
+
+
+def squared_errors_mm2(prediction: Prediction) -> FloatArray:
+    """(m,) squared centre error of every shot, or mean squared radial residual for line profiles."""
+    centre = (prediction.centre_error_mm**2).sum(axis=1)
+    return np.asarray(np.where(np.isfinite(centre), centre, prediction.sum_of_squares_mm2 / prediction.n_points))
+
+
+def shot_centre_covariance_mm2(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Covariance (m, 3, 3) of each shot's own centre from its points and pose noise, base axes, and what moves it.
+
+    The second result (m, 3, P) is the motion of the shot's fixed-radius centre, less its sphere's, per unknown.
+    """
+    noise = solution.noise
+    rotation = solution.geometry.base_from_camera[:, :3, :3]
+    rotation_t = np.swapaxes(rotation, -1, -2)
+    moments = solution.moments
+    inverse = np.linalg.inv(moments[:, :3, :3])
+    weight = noise.point_weight(np.diff(problem.starts).astype(np.float64))
+    centre = se3.apply(solution.geometry.base_from_camera, solution.geometry.centre_in_camera_mm)
+    lever = se3.hat(centre - solution.geometry.base_from_flange[:, :3, 3])
+    pose = noise.pose_mm**2 * np.eye(3) + noise.pose_rad**2 * lever @ np.swapaxes(lever, -1, -2)
+    points = rotation @ (inverse / weight[:, None, None]) @ rotation_t
+    sensitivity = rotation @ (inverse @ (moments[:, :3, :-1] @ solution.geometry.columns))
+    return points + pose, sensitivity

@@ -1,0 +1,75 @@
+"""pass, marginal or fail, and why: what a calibration engineer would hold against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from acquire.cell import Limits
+from calibrate.identifiability import Identifiability
+
+_MANY_REJECTED, _TOO_MANY_REJECTED = 0.1, 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the verdict is built on."""
+
+    limits: Limits | None
+    cross_validated_rms_mm: float
+    length_expanded_uncertainty_mm: float | None
+    """k = 2, of a length between the two farthest sphere places; None with one place."""
+    n_shots: int
+    used: int
+    has_joints: bool
+    has_certified_length: bool
+    line_profile: bool
+    covariance_scale: float
+
+
+def judge(evidence: Evidence, identifiability: Identifiability) -> tuple[str, tuple[str, ...]]:
+    """Verdict and its reasons, the gravest first."""
+    fail = _grave(evidence, identifiability)
+    marginal = _doubts(evidence)
+    if fail:
+        return "fail", tuple(fail + marginal)
+    return ("marginal" if marginal else "pass"), tuple(marginal)
+
+
+def _grave(e: Evidence, identifiability: Identifiability) -> list[str]:
+    found = []
+    missing = identifiability.expected_rank - identifiability.rank
+    if missing > 0:
+        found.append(
+            f"the shots leave {missing} of {identifiability.expected_rank} directions open (rank {identifiability.rank}): "
+            "spread the sphere in depth and across the view, and turn the camera about more axes"
+        )
+    rejected = 1 - e.used / max(e.n_shots, 1)
+    if rejected > _TOO_MANY_REJECTED:
+        found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
+    if e.limits is not None and not e.line_profile and e.cross_validated_rms_mm > e.limits.centre_rms_mm:
+        found.append(f"held-out shots are missed by {e.cross_validated_rms_mm:.3f} mm rms, the limit is {e.limits.centre_rms_mm:g} mm")
+    return found
+
+
+def _doubts(e: Evidence) -> list[str]:
+    found = []
+    if not e.has_joints:
+        found.append(
+            "the robot is taken as it reports: flange poses without axis angles leave its uncalibrated geometry in every figure "
+            f"(held-out rms {e.cross_validated_rms_mm:.3f} mm)"
+        )
+    if e.limits is None:
+        found.append("no limits given in the cell file: there is nothing to pass against")
+    elif e.length_expanded_uncertainty_mm is not None and e.length_expanded_uncertainty_mm > e.limits.length_error_mm:
+        found.append(
+            f"a length between sphere places has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm"
+        )
+    if e.has_joints and not e.has_certified_length:
+        found.append("no certified length was seen: the scale over the volume rests on sphere diameters and depth alone")
+    if _MANY_REJECTED < 1 - e.used / max(e.n_shots, 1) <= _TOO_MANY_REJECTED:
+        found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
+    if e.has_joints and e.covariance_scale > 4.0:
+        found.append(f"held-out shots miss by {np.sqrt(e.covariance_scale):.1f} times what the noise explains: something is not in the model")
+    return found
