@@ -57,6 +57,22 @@ def _earlier(path: Path, file_format: str) -> bytes:
     return data
 
 
+def require_writable(path: Path) -> None:
+    """See, before long work, that its result can be written.
+
+    Raises:
+        FileError: the folder is missing or not writable.
+        SettingsError: the path is a folder.
+    """
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise FileError("no such folder", file=folder, remedy="Make it, or name another one with -o.")
+    if not os.access(folder, os.W_OK):
+        raise FileError("may not be written to", file=folder, remedy="Name another folder with -o.")
+    if path.is_dir():
+        raise SettingsError("is a folder", file=path, remedy="Name a file with -o.")
+
+
 def _not_ours(path: Path, file_format: str) -> SettingsError:
     return SettingsError(f"exists and is no {file_format} file", file=path, remedy="Name another file with -o.")
 

@@ -1,0 +1,112 @@
+"""`spherecal verify` and `spherecal stitch`: what a calibration is worth, and what it is for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from measure.cli_run import AsJson, Debug, Quiet, command
+
+if TYPE_CHECKING:
+    from measure.console import Console
+    from measure.verify_result import VerifyResult
+
+CalibrationFile = Annotated[Path, typer.Argument(help="calibration.yaml, as `calibrate` writes it.")]
+SessionFolders = Annotated[list[Path], typer.Argument(help="Session folders.")]
+
+
+def verify(
+    calibration: CalibrationFile,
+    sessions: SessionFolders,
+    allow_training_data: Annotated[bool, typer.Option("--allow-training-data", help="Take shots of the calibration itself too.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Prove a calibration on shots that it never saw. Exit code 3 when the verdict is reject."""
+    with command(as_json, debug, quiet) as run:
+        from calibrate import Calibration
+        from drivers.files.session import read_session
+        from measure.verify import verify as verify_sessions
+
+        loaded = Calibration.load(calibration)
+        result = verify_sessions(loaded, [read_session(folder) for folder in sessions], allow_training_data=allow_training_data)
+        tell_verification(run.console, result)
+        run.finish(result.to_json_dict(), verdict=result.verdict)
+
+
+def tell_verification(console: Console, result: VerifyResult) -> None:
+    """Figures before and after, lengths, verdict and reasons, for a person."""
+    console.table("", ["on unseen shots, mm", "uncalibrated", "calibrated"], comparison_rows(result))
+    rows = [
+        [length.label, length.measured_mm, length.reference_mm, f"{length.error_mm:+.3f}", length.expanded_uncertainty_mm, length.not_judged or ""]
+        for length in result.lengths
+    ]
+    if rows:
+        console.table("lengths, mm", ["between", "measured", "certified", "error", "U (k=2)", "not judged"], rows)
+    tell_rejected(console, [(result.session_name(shot.session), shot.index, shot.reason) for shot in result.rejected])
+    tell_verdict(console, result.verdict, result.reasons)
+
+
+def comparison_rows(result: VerifyResult) -> list[list[object]]:
+    """The before/after table: what changed by calibrating, in plain words."""
+    after, before = result.figures, result.before
+    lengths_after = [length.error_mm for length in result.lengths]
+    lengths_before = list(result.before_length_errors_mm.values())
+    rows: list[list[object]] = [
+        ["scatter of a sphere's centre between views (rms)", before and before.centre_rms_mm, after.centre_rms_mm],
+        ["worst single view", before and before.centre_max_mm, after.centre_max_mm],
+    ]
+    if lengths_after:
+        rows.append([f"error of {len(lengths_after)} lengths between spheres (rms)", _rms(lengths_before), _rms(lengths_after)])
+        rows.append(["worst length", _worst(lengths_before), _worst(lengths_after)])
+    if after.spheres:
+        diameters_before = [sphere.diameter_error_mm for sphere in before.spheres.values()] if before else []
+        rows.append(["error of a sphere's diameter (worst)", _worst(diameters_before), _worst([s.diameter_error_mm for s in after.spheres.values()])])
+    return rows
+
+
+def tell_rejected(console: Console, rejected: list[tuple[str, int, str]]) -> None:
+    """Shots that were not used, and why."""
+    if rejected:
+        console.table("not used", ["session", "shot", "reason"], [list(row) for row in rejected])
+
+
+def tell_verdict(console: Console, verdict: str, reasons: tuple[str, ...]) -> None:
+    """The verdict, and a line for each reason."""
+    console.say(f"verdict: {verdict}")
+    for reason in reasons:
+        console.say(f"  {reason}")
+
+
+def _rms(values: list[float]) -> float | None:
+    return (sum(value * value for value in values) / len(values)) ** 0.5 if values else None
+
+
+def _worst(values: list[float]) -> float | None:
+    return max((abs(value) for value in values), default=None)
+
+
+def stitch(
+    calibration: CalibrationFile,
+    session: Annotated[Path, typer.Argument(help="The session whose scans are to be put together.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The cloud to write (PLY, mm, robot base).")] = Path("cloud.ply"),
+    voxel: Annotated[float, typer.Option("--voxel", metavar="MM", help="Edge of the voxels: one point each.")] = 0.5,
+    keep_edges: Annotated[bool, typer.Option("--keep-edges", help="Keep flying pixels at depth edges.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Put the scans of a session together into one cloud in the robot base."""
+    with command(as_json, debug, quiet) as run:
+        from calibrate import Calibration
+        from drivers.files.session import read_session
+        from measure.stitch import stitch as stitch_session
+
+        loaded, read = Calibration.load(calibration), read_session(session)
+        with run.console.progress("stitching") as advance:
+            result = stitch_session(loaded, read, out, voxel, clean_edges=not keep_edges, on_progress=advance)
+        run.console.say(f"{result.n_points} points of {result.n_points_in} read, from {result.n_scans} scans, in {out} ({result.seconds:.1f} s)")
+        run.finish(result.to_json_dict())
