@@ -19,6 +19,8 @@ IntArray = NDArray[np.int64]
 
 _LOAD_LIMIT = 0.7
 _START_CAPACITY = 1 << 12
+_GROWS_FOURFOLD_BELOW = 1 << 20
+_LINES_LOOKED_AT = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,8 @@ class VoxelGrid:
             limit = int(_LOAD_LIMIT * self._table.shape[0])
             row, self._n_used = kernels.insert(self._table, fates, points, row, self._n_used, limit, self.voxel_mm)
             if self._n_used >= limit:
-                self._grow_to(2 * self._table.shape[0])
+                capacity = self._table.shape[0]
+                self._grow_to((4 if capacity < _GROWS_FOURFOLD_BELOW else 2) * capacity)
         if fates[kernels.CROWDED]:
             raise DataError(
                 f"a voxel of {self.voxel_mm:g} mm holds more than {kernels.COUNT_LIMIT} points",
@@ -94,23 +97,17 @@ class VoxelGrid:
         if other.voxel_mm != self.voxel_mm:
             raise SettingsError(f"grids of {self.voxel_mm:g} and {other.voxel_mm:g} mm cannot be merged", remedy="Use one voxel size.")
         self._reserve(self._n_used + other.n_voxels)
-        self._n_used += int(kernels.absorb(self._table, other._rows()))
+        self._n_used += int(kernels.absorb(self._table, other._table))
 
     def fused(self, *, min_count: int = 1) -> FusedCloud:
         """The cloud so far; voxels with fewer than `min_count` points are left out."""
         from measure import fuse_kernels as kernels
 
-        rows = self._rows()
-        rows = rows[rows[:, kernels.COUNT] >= max(1, min_count)]
-        rows = rows[np.argsort(rows[:, kernels.KEY])]
-        points, spread = np.empty((rows.shape[0], 3)), np.empty(rows.shape[0])
-        kernels.summarise(rows, self.voxel_mm, points, spread)
-        return FusedCloud(points, rows[:, kernels.COUNT].copy(), spread, self.voxel_mm)
-
-    def _rows(self) -> IntArray:
-        from measure import fuse_kernels as kernels
-
-        return np.asarray(self._table[self._table[:, kernels.KEY] != kernels.EMPTY])
+        slots = np.flatnonzero(self._table[:, kernels.COUNT] >= max(1, min_count))
+        slots = slots[np.argsort(self._table[slots, kernels.KEY])]
+        points, spread = np.empty((len(slots), 3)), np.empty(len(slots))
+        kernels.summarise(self._table, slots, self.voxel_mm, points, spread)
+        return FusedCloud(points, self._table[slots, kernels.COUNT], spread, self.voxel_mm)
 
     def _reserve(self, n_voxels: int) -> None:
         capacity = self._table.shape[0]
@@ -146,14 +143,23 @@ def flying_pixel_mask(xyz_mm: NDArray[np.float32], *, max_step_ratio: float = 6.
 def _pixel_step_per_depth(xyz_mm: NDArray[np.float32]) -> float:
     """Median distance of neighbouring lines of sight at depth 1, NaN where no two neighbours are valid.
 
-    Taken from x/z and y/z, which a step in depth does not change.
+    Taken from x/z and y/z, which a step in depth does not change, along some rows and some columns.
     """
+    medians = [_median_step(lines) for lines in (_some(xyz_mm), _some(xyz_mm.swapaxes(0, 1)))]
+    return max((median for median in medians if np.isfinite(median)), default=float("nan"))
+
+
+def _some(lines: NDArray[np.float32]) -> NDArray[np.float32]:
+    return lines[:: max(1, len(lines) // _LINES_LOOKED_AT)]
+
+
+def _median_step(lines_mm: NDArray[np.float32]) -> float:
+    """Of points (k, m, 3) along their second axis."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        rays = (xyz_mm[..., :2] / xyz_mm[..., 2:]).astype(np.float64)
-    steps = [np.linalg.norm(np.diff(rays, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    finite = [step[np.isfinite(step)] for step in steps]
-    medians = [float(np.median(step)) for step in finite if step.size]
-    return max(medians, default=float("nan"))
+        rays = lines_mm[..., :2].astype(np.float64) / lines_mm[..., 2:]
+    steps = np.hypot(*np.moveaxis(np.diff(rays, axis=1), -1, 0))
+    finite = steps[np.isfinite(steps)]
+    return float(np.median(finite)) if finite.size else float("nan")
 
 
 def _empty_table(capacity: int) -> IntArray:

@@ -21,6 +21,7 @@ Progress = Callable[[int, int], None]
 """Called after each scan with the number done and the number of all."""
 
 _SMALLEST_SCAN_MM = 20.0
+_PIECE = 1 << 15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,10 +105,9 @@ def stitch(
         valid = np.asarray(np.isfinite(cloud.xyz_mm).all(axis=-1))
         _require_mm(cloud, valid, session, shot)
         kept = _without_edges(cloud, valid) if clean_edges else valid
-        added = grid.add(points_of_shot_in_base_mm(calibration, session, shot, cloud.xyz_mm[kept].astype(np.float64)))
+        n_outside += _fuse(grid, calibration, session, shot, cloud.xyz_mm[kept])
         n_valid += int(valid.sum())
         n_edge += int(valid.sum() - kept.sum())
-        n_outside += added.n_outside
         if on_progress is not None:
             on_progress(done, len(shots))
     fused = grid.fused(min_count=min_count)
@@ -154,6 +154,16 @@ def _read_ahead(session: Session, shots: Sequence[Shot]) -> Iterator[tuple[Shot,
             yield shot, cloud
 
 
+def _fuse(grid: VoxelGrid, calibration: MeasuringSystem, session: Session, shot: Shot, points_in_camera_mm: NDArray[np.float32]) -> int:
+    """Move points (n, 3) to the base and add them; the number that fell outside the grid's range.
+
+    In pieces that stay in the processor's cache: a whole scan at once takes twice as long.
+    """
+    pieces = range(0, len(points_in_camera_mm), _PIECE)
+    clouds = (points_of_shot_in_base_mm(calibration, session, shot, points_in_camera_mm[i : i + _PIECE].astype(np.float64)) for i in pieces)
+    return sum(grid.add(cloud).n_outside for cloud in clouds)
+
+
 def _without_edges(cloud: PointCloud, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     # a scan without a grid has no neighbours to judge by
     if cloud.xyz_mm.ndim != 3 or min(cloud.xyz_mm.shape[:2]) < 3:
@@ -162,7 +172,10 @@ def _without_edges(cloud: PointCloud, valid: NDArray[np.bool_]) -> NDArray[np.bo
 
 
 def _require_mm(cloud: PointCloud, valid: NDArray[np.bool_], session: Session, shot: Shot) -> None:
-    if valid.any() and float(np.abs(cloud.xyz_mm[valid]).max()) < _SMALLEST_SCAN_MM:
+    # a look at some points clears nearly every scan
+    if any(valid[part].any() and float(np.abs(cloud.xyz_mm[part][valid[part]]).max()) >= _SMALLEST_SCAN_MM for part in (np.s_[::97], np.s_[:])):
+        return
+    if valid.any():
         raise DataError(
             f"the whole scan of shot {shot.index} lies within {_SMALLEST_SCAN_MM:g} mm of the camera",
             file=session.folder / str(shot.scan),
