@@ -14,8 +14,10 @@ import typer
 
 from measure.cli_capture import capture
 from measure.cli_cell import doctor, new_cell
+from measure.cli_demo import demo
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
+from measure.cli_report import report, show
 from measure.cli_run import run_app
 from measure.cli_solve import calibrate, centres
 from measure.console import Console
@@ -31,6 +33,7 @@ app = typer.Typer(
 new = typer.Typer(help="Write a new file to start from.", no_args_is_help=True, rich_markup_mode=None)
 new.command("cell")(new_cell)
 
+app.command("demo")(demo)
 app.add_typer(new, name="new")
 app.command("doctor")(doctor)
 app.command("plan")(plan)
@@ -39,6 +42,8 @@ app.command("centres")(centres)
 app.command("calibrate")(calibrate)
 app.command("verify")(verify)
 app.command("stitch")(stitch)
+app.command("report")(report)
+app.command("show")(show)
 
 
 @app.callback(invoke_without_command=True)

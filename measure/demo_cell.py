@@ -17,7 +17,7 @@ from drivers.files.yaml import dump_yaml
 from drivers.kinematics.se3 import FloatArray
 
 ROBOT_MODEL = "irb1410_paper"
-RESOLUTION_PX = (640, 400)
+RESOLUTION_PX = (512, 320)
 TABLE_TOP_MM = 60.0
 DIAMETER_MM = 38.1
 DIAMETER_U_MM = 0.001

@@ -1,0 +1,116 @@
+"""`spherecal report` and `spherecal show`: a page for people, and a recording to look round in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from measure.cli_measure import CalibrationFile
+from measure.cli_run import AsJson, Debug, Quiet, command
+
+if TYPE_CHECKING:
+    from calibrate import Calibration
+    from drivers.files.session import Session
+
+AnySessions = Annotated[list[Path] | None, typer.Argument(help="Session folders.")]
+
+
+def report(
+    calibration: CalibrationFile,
+    sessions: AnySessions = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write.")] = Path("report.html"),
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write report.html: the calibration and, where unseen sessions are named, its proof on them."""
+    with command(as_json, debug, quiet) as run:
+        from acquire.cell import cell_of_session
+        from calibrate import Calibration
+        from drivers.files.session import read_session
+        from measure.files import require_writable
+        from measure.report import write_report
+        from measure.verify import verify
+
+        require_writable(out)
+        loaded = Calibration.load(calibration)
+        read = [read_session(folder) for folder in sessions or []]
+        unseen = [session for session in read if not is_training(loaded, session)]
+        result = verify(loaded, unseen) if unseen else None
+        cell = cell_of_session(read[0]) if read else None
+        write_report(out, loaded, result, cell=cell, session_names={session.digest: session.folder.name for session in read})
+        run.console.say(f"{out} written")
+        verdict = loaded.verdict if result is None else result.verdict
+        run.finish({"out": out, "verdict": verdict, "verified": result is not None})
+
+
+def show(
+    calibration: CalibrationFile,
+    sessions: Annotated[list[Path], typer.Argument(help="Session folders: of the calibration, unseen ones, a workpiece.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The recording to write.")] = Path("run.rrd"),
+    view: Annotated[bool, typer.Option("--view", help="Open it in the Rerun viewer.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a Rerun recording: robot, camera and clouds of every shot, before and after."""
+    with command(as_json, debug, quiet) as run:
+        from calibrate import Calibration
+        from drivers.files.session import read_session
+        from measure.files import require_writable
+
+        require_writable(out)
+        loaded = Calibration.load(calibration)
+        record(out, loaded, [read_session(folder) for folder in sessions])
+        run.console.say(f"{out} written; look at it with: rerun {out}")
+        if view:
+            _open_viewer(out)
+        run.finish({"out": out})
+
+
+def is_training(calibration: Calibration, session: Session) -> bool:
+    """Whether a calibration was made from shots of this session."""
+    known = {shot.scan_sha256 for shot in calibration.shots}
+    return any(shot.sha256 in known for shot in session.shots)
+
+
+def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None:
+    """Write a recording of sessions of all kinds; at most one of them of a workpiece.
+
+    Raises:
+        SettingsError: two workpieces.
+        DataError: no shot can be shown.
+        FileError: a session is broken, or the file cannot be written.
+    """
+    from acquire.cell import cell_of_session, robot_model_of
+    from calibrate.observations import gather_observations
+    from drivers.errors import SettingsError
+    from measure.run_scene import scene_of
+    from measure.verify import verify
+    from measure.viewer import write_recording
+
+    cell = cell_of_session(sessions[0])
+    workpieces = [session for session in sessions if session.purpose == "workpiece"]
+    if len(workpieces) > 1:
+        raise SettingsError("two workpieces do not fit one recording", file=workpieces[1].folder, remedy="Name one workpiece session.")
+    of_spheres = [session for session in sessions if session.purpose != "workpiece"]
+    trained = [session for session in of_spheres if is_training(calibration, session)]
+    unseen = [session for session in of_spheres if not is_training(calibration, session)]
+    shots = gather_observations(trained, cell=cell, model=robot_model_of(cell, trained[0])).shots if trained else ()
+    verification = verify(calibration, unseen) if unseen else None
+    scene = scene_of(calibration, cell, shots, verification=verification, workpiece=workpieces[0] if workpieces else None)
+    write_recording(out, scene)
+
+
+def _open_viewer(path: Path) -> None:
+    import subprocess
+    import sys
+
+    from drivers.errors import SettingsError
+
+    try:
+        subprocess.Popen([sys.executable, "-m", "rerun", str(path)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except OSError as error:
+        raise SettingsError(f"the viewer cannot be started ({error})", remedy=f"Start it by hand: rerun {path}") from error
