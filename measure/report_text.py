@@ -75,6 +75,14 @@ def result_rows(facts: CalibrationFacts, verification: VerifyResult | None) -> t
 
 def _scatter_rows(verification: VerifyResult) -> list[Row]:
     after, before = verification.figures, verification.before
+    radial = _row(
+        "radial rms",
+        "How far the single points of all shots lie from one common sphere: scatter of the shots and noise of the camera together.",
+        None if before is None else before.radial_rms_mm,
+        after.radial_rms_mm,
+    )
+    if after.centre_rms_mm is None:
+        return [radial]
     return [
         _row(
             "centre rms",
@@ -85,12 +93,7 @@ def _scatter_rows(verification: VerifyResult) -> list[Row]:
             _mark(verification, ["centre rms"]),
         ),
         _row("largest centre distance", "The worst single shot.", None if before is None else before.centre_max_mm, after.centre_max_mm),
-        _row(
-            "radial rms",
-            "How far the single points of all shots lie from one common sphere: scatter of the shots and noise of the camera together.",
-            None if before is None else before.radial_rms_mm,
-            after.radial_rms_mm,
-        ),
+        radial,
     ]
 
 
@@ -126,7 +129,9 @@ def result_lead(verification: VerifyResult | None) -> str:
         return "No verification was given. The only honest figure of a calibration alone is its prediction of shots that were left out of the solve."
     unseen = " that the calibration never saw" if verification.held_out else ""
     places = len(verification.figures.spheres)
-    seen = f"{verification.used} of {verification.n_shots} shots{unseen}, at {places} sphere places"
+    seen = f"{verification.used} of {verification.n_shots} shots{unseen}, at {places} place{'' if places == 1 else 's'} of spheres"
+    if verification.before is None:
+        return f"Figures on {seen}. The cell file has no first guess of the hand-eye, so there is no uncalibrated system to compare with."
     return f"Figures on {seen}. Uncalibrated: nominal robot and first guess of the hand-eye."
 
 
@@ -160,7 +165,7 @@ def calibration_rows(facts: CalibrationFacts) -> tuple[Row, ...]:
             f"{facts.rank} of {facts.n_parameters}",
         ),
         Row("radial rms of the training points", "Fit, not accuracy: the shots the solve was made from.", "", mm(facts.train_rms_mm)),
-        Row("centre rms, shots left out in turn", "Each shot predicted by a solve that never saw it.", "", mm(facts.cross_validated_rms_mm)),
+        Row("rms of shots left out in turn", "Each shot predicted by a solve that never saw it.", "", mm(facts.cross_validated_rms_mm)),
         Row("optical radius offset", "By how much the spheres read larger than certified, in radius.", "", mm(facts.radius_offset_mm, signed=True)),
         Row("datum", "Which base frame the results are in: a free calibration moves it by tenths of a mm.", "", facts.datum),
     )

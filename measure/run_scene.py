@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from measure.verify_result import VerifyResult
 
 _WORKPIECE_POINTS = 20_000
 _DEFAULT_VIEW_DEG = (40.0, 30.0)
+_DEFAULT_DEPTH_MM = 350.0
+_NEAREST_MM = 50.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,19 +64,22 @@ def scene_of(
         DataError: a shot lacks the pose that the calibration needs, or points fix no sphere.
         FileError: a workpiece scan is broken.
     """
-    everything = (*shots, *(verification.observations.shots if verification else ()))
-    seen = _figures(calibration, cell, everything) if everything else None
-    steps = [] if seen is None else list(_sphere_steps(calibration, seen))
+    groups = [_figures(calibration, cell, tuple(shots))] if shots else []
+    if verification is not None:
+        groups.append(_figures(calibration, cell, verification.observations.shots))
+    steps = [step for group in groups for step in _sphere_steps(calibration, group)]
     if workpiece is not None:
         steps += _workpiece_steps(calibration, cell, workpiece)
+    depths = [float(np.median(shot.points_in_camera_mm[:, 2])) for group in groups for shot in group.shots]
+    is_area = cell.camera.kind == "area"
     return Scene(
         title=f"spherecal: {calibration.cell_name}",
         steps=tuple(steps),
-        spheres=() if seen is None else tuple(_marks(calibration, cell, seen)),
+        spheres=tuple(_marks_of_all(calibration, groups)),
         texts={"summary": _summary(calibration, verification), "how to read this": _HELP},
         shape=() if calibration.model is None else calibration.model.shape,
-        field_of_view_deg=cell.camera.field_of_view_deg or _DEFAULT_VIEW_DEG,
-        depth_mm=float(np.median([np.median(s.points_in_camera_mm[:, 2]) for s in everything])) if everything else 350.0,
+        field_of_view_deg=(cell.camera.field_of_view_deg or _DEFAULT_VIEW_DEG) if is_area else None,
+        depth_mm=max(float(np.median(depths)), _NEAREST_MM) if depths else _DEFAULT_DEPTH_MM,
         stitched_in_base_mm=stitched_in_base_mm,
     )
 
@@ -146,7 +151,16 @@ def _link_frames(calibration: Calibration, pose: dict[str, FloatArray]) -> Float
     return np.asarray(calibration.datum.base_from_solver @ mdh.chain(calibration.model, pose["joints_rad"], calibration.link_twists))
 
 
-def _marks(calibration: Calibration, cell: Cell, seen: _Shots) -> Iterator[SphereMark]:
+def _marks_of_all(calibration: Calibration, groups: Sequence[_Shots]) -> Iterator[SphereMark]:
+    """Spheres of the calibration, then those of the verification: a name may stand for another place there."""
+    taken: set[str] = set()
+    for group in groups:
+        for mark in _marks(calibration, group):
+            yield replace(mark, name=f"{mark.name} (verification)") if mark.name in taken else mark
+        taken |= set(group.after.spheres)
+
+
+def _marks(calibration: Calibration, seen: _Shots) -> Iterator[SphereMark]:
     place = calibrated_placing(calibration)
     for name, sphere in seen.after.spheres.items():
         own = [shot for shot in seen.shots if shot.sphere == name]

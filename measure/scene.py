@@ -63,7 +63,8 @@ class Scene:
     """Markdown documents by title."""
     shape: tuple[Capsule, ...] = ()
     """Bodies of the robot's links, in the frames of `Step.base_from_links`."""
-    field_of_view_deg: tuple[float, float] = (40.0, 30.0)
+    field_of_view_deg: tuple[float, float] | None = (40.0, 30.0)
+    """Full angles across and down; None where the camera has no such view (a line profile)."""
     depth_mm: float = 350.0
     """Where the camera's image plane is drawn."""
     stitched_in_base_mm: FloatArray | None = None

@@ -70,7 +70,9 @@ def verify(
     limits = limits or next((c.limits for c in cells if c.limits is not None), None) or calibration.limits
     line_profile = cells[0].camera.kind == "line_profile"
     sizes = {name: SphereSize(s.radius_mm, calibration.radius_offset_mm) for name, s in spheres.items()}
-    figures = figures_of(views_of(observations.shots, calibrated_placing(calibration)), sizes, line_profile=line_profile)
+    views = views_of(observations.shots, calibrated_placing(calibration))
+    _require_still_spheres(views, sessions, spheres)
+    figures = figures_of(views, sizes, line_profile=line_profile)
     before = _figures_before(observations, sessions, cells, spheres, line_profile=line_profile)
     results = tuple(_length(calibration, length, figures, observations) for length in lengths if set(length.between) <= set(figures.spheres))
     judgements = () if limits is None else _judgements(limits, figures, results, spheres)
@@ -146,6 +148,24 @@ def _merged(cells: Sequence[Cell]) -> tuple[dict[str, Sphere], list[CertifiedLen
         for length in cell.lengths:
             lengths.setdefault(length.between, length)
     return spheres, list(lengths.values())
+
+
+def _require_still_spheres(views: Sequence[SphereView], sessions: Sequence[Session], spheres: Mapping[str, Sphere]) -> None:
+    """Refuse a sphere that was moved between two sessions without a new name: no fit of all its views means anything."""
+    first_place: dict[str, FloatArray] = {}
+    for session in sessions:
+        for name, sphere in spheres.items():
+            starts = [view.start_in_base_mm for view in views if view.sphere == name and view.session == session.digest]
+            if not starts:
+                continue
+            place = np.median(starts, axis=0)
+            moved_mm = float(np.linalg.norm(place - first_place.setdefault(name, place)))
+            if moved_mm > sphere.radius_mm:
+                raise DataError(
+                    f"sphere {name} stands {moved_mm:.0f} mm from where an earlier session shows it",
+                    file=session.folder,
+                    remedy="Verify the sessions apart, or give a moved sphere a name of its own.",
+                )
 
 
 def _figures_before(

@@ -106,7 +106,9 @@ def _log_step(stream: rr.RecordingStream, scene: Scene, step: Step) -> None:
     import rerun as rr
 
     _log_robot(stream, scene, step)
-    stream.log("base/camera", _transform(step.base_from_camera), _frustum(scene))
+    stream.log("base/camera", _transform(step.base_from_camera), rr.TransformAxes3D(0.06))
+    if scene.field_of_view_deg is not None:
+        stream.log("base/camera", _frustum(scene.field_of_view_deg, scene.depth_mm))
     stream.log("base/shot/before", _points(step.before_in_base_mm, BEFORE_COLOUR, _POINTS_PER_STEP))
     stream.log("base/shot/after", _points(step.after_in_base_mm, AFTER_COLOUR, _POINTS_PER_STEP))
     stream.log("texts/shot", rr.TextLog(step.label, level=rr.TextLogLevel.INFO))
@@ -128,12 +130,14 @@ def _log_robot(stream: rr.RecordingStream, scene: Scene, step: Step) -> None:
 
 
 def _arm_line_mm(step: Step) -> FloatArray:
-    """Corners of the line from the base through the link origins to the camera.
+    """Corners of the line from the base through the link origins to the camera; from the flange on where links are unknown.
 
     Along a link the way first follows the previous axis and then the common normal, as the arm itself does; a straight
     line between two origins would cut the corner.
     """
     origins = step.base_from_links[:, :3, 3]
+    if len(origins) == 1:
+        return np.array([origins[0], step.base_from_camera[:3, 3]])
     corners = [np.zeros(3)]
     for frame, origin in zip(step.base_from_links, origins, strict=True):
         along_axis = float((origin - corners[-1]) @ frame[:3, 2])
@@ -141,13 +145,13 @@ def _arm_line_mm(step: Step) -> FloatArray:
     return np.array([*corners, step.base_from_camera[:3, 3]])
 
 
-def _frustum(scene: Scene) -> Any:
+def _frustum(field_of_view_deg: tuple[float, float], depth_mm: float) -> Any:
     import rerun as rr
 
-    half = np.tan(np.deg2rad(np.asarray(scene.field_of_view_deg)) / 2)
+    half = np.tan(np.deg2rad(np.asarray(field_of_view_deg)) / 2)
     size = 1000.0 * half / half.max()
     focal = size / 2 / half
-    return rr.Pinhole(focal_length=focal, resolution=size, image_plane_distance=scene.depth_mm * _MM, color=(120, 180, 255), line_width=0.0015)
+    return rr.Pinhole(focal_length=focal, resolution=size, image_plane_distance=depth_mm * _MM, color=(120, 180, 255), line_width=0.0015)
 
 
 def _wire_sphere(sphere: SphereMark) -> Any:
@@ -224,9 +228,10 @@ def _by_link(shape: Iterable[Capsule]) -> dict[int, list[Capsule]]:
 
 
 def _curve_colours(scene: Scene) -> dict[str, tuple[int, int, int]]:
-    palette = [BEFORE_COLOUR, AFTER_COLOUR, (160, 120, 220), (120, 190, 90), (200, 90, 130)]
+    others = [(160, 120, 220), (120, 190, 90), (200, 90, 130)]
     names = dict.fromkeys(name for step in scene.steps for name in step.curves)
-    return {name: palette[i % len(palette)] for i, name in enumerate(names)}
+    sides = {"before": BEFORE_COLOUR, "after": AFTER_COLOUR}
+    return {name: sides.get(name.split(":")[0], others[i % len(others)]) for i, name in enumerate(names)}
 
 
 def _entity(name: str) -> str:
@@ -241,7 +246,7 @@ def _layout(scene: Scene) -> Any:
     cell = rrb.Spatial3DView(origin="base", contents=["+ base/**", "- base/all_shots/**"], name="cell", eye_controls=_eye(scene))
     texts = [rrb.TextDocumentView(origin=f"texts/{_entity(title)}", name=title) for title in scene.texts]
     close = [_close_view(scene, sphere) for sphere in scene.spheres if _sides(sphere)]
-    curves = rrb.TimeSeriesView(origin="curves", name="residuals in mm over the poses")
+    curves = rrb.TimeSeriesView(origin="curves", name="residuals in mm over the poses", plot_legend=rrb.PlotLegend(corner="RightTop"))
     log = rrb.TextLogView(origin="texts/shot", name="shots")
     right: list[Any] = [rrb.Tabs(*texts, log), *([rrb.Tabs(*close)] if close else []), curves]
     shares = [2.0, *([2.2] if close else []), 1.6]

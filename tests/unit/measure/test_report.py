@@ -135,6 +135,7 @@ def test_bare_facts_make_a_page_too(calibration: Calibration, verification: Veri
     bare = replace(verification, before=None, lengths=(), before_length_errors_mm={}, limits=None, judgements=(), verdict="not_proven", reasons=())
     text, _ = read(write_page(tmp_path / "report.html", facts, bare))
     assert "Not proven" in text
+    assert "no uncalibrated system to compare with" in text
     assert "none" in text
 
 

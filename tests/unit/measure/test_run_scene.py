@@ -84,6 +84,7 @@ def test_verification_and_workpiece_follow_and_the_whole_is_written(
     )
     assert len(scene.steps) == 6 + 6 + 2
     assert scene.steps[-1].label.startswith("workpiece")
+    assert {mark.name for mark in scene.spheres} == {"A", "B", "A (verification)", "B (verification)"}
     assert "unseen shots" in scene.texts["summary"]
     assert write_recording(tmp_path / "run.rrd", scene).stat().st_size > 10_000
 

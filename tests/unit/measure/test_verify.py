@@ -197,3 +197,14 @@ def test_cells_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
         verify(SYSTEM, [one, two])
 
 
+
+
+def test_a_sphere_moved_between_sessions_under_one_name_is_refused(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path)
+    one = record_session(tmp_path / "one", cell, np.random.default_rng(11), shots_per_sphere=2)
+    moved = {"A": (900.0, 150.0, 300.0), "B": PLACES["B"]}
+    two = record_session(tmp_path / "two", cell, np.random.default_rng(12), places=moved, shots_per_sphere=2)
+    with pytest.raises(DataError, match="name of its own") as caught:
+        verify(SYSTEM, [one, two])
+    assert caught.value.file == str(two.folder)
+    assert "sphere A stands 50 mm" in caught.value.message
