@@ -50,7 +50,7 @@ def write_report(
         calibration: what is reported on.
         verification: on shots that it never saw.
         cell: for the camera's working range, and whether the cell is simulated.
-        session_names: names of the calibration's sessions by their digest.
+        session_names: names of the calibration's sessions by their digest, instead of their folders.
 
     Raises:
         FileError: the folder is missing or not writable.

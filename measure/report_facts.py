@@ -23,9 +23,9 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
     Args:
         calibration: the calibration.
         cell: for the camera's working range, and whether the cell is simulated.
-        session_names: names by digest; digests are shortened where there is none.
+        session_names: names by digest, instead of the folders that the calibration names.
     """
-    names = session_names or {}
+    names = {**_folders(calibration.inputs), **(session_names or {})}
     statistics = calibration.statistics
     return CalibrationFacts(
         id=calibration.id,
@@ -44,7 +44,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         radius_offset_mm=calibration.radius_offset_mm,
         datum=_DATUM_TEXTS.get(calibration.datum.kind, calibration.datum.kind),
         simulated=_is_simulated(calibration, cell),
-        identity=dict(_identity(calibration, names)),
+        identity=dict(_identity(calibration)) | dict(_artefacts(cell)),
         shots=tuple(_residual(shot) for shot in calibration.shots),
         residual_name=_residual_name(calibration.shots),
         seen_mm=calibration.camera_seen_volume_mm,
@@ -84,12 +84,26 @@ def _is_simulated(calibration: Calibration, cell: Cell | None) -> bool:
     return "simulated" in {*drivers, *(str(value) for value in calibration.identity.values())}
 
 
-def _identity(calibration: Calibration, names: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _folders(inputs: Mapping[str, object]) -> dict[str, str]:
+    """Folder names of the calibration's sessions by digest, as far as its inputs tell them."""
+    sessions = inputs.get("sessions")
+    rows = [row for row in sessions if isinstance(row, Mapping)] if isinstance(sessions, list | tuple) else []
+    return {str(row["digest"]): str(row["folder"]) for row in rows if "digest" in row and "folder" in row}
+
+
+def _artefacts(cell: Cell | None) -> Iterator[tuple[str, str]]:
+    if cell is None:
+        return
+    for name, sphere in cell.spheres.items():
+        certificate = f", certificate: {sphere.certificate}" if sphere.certificate else ""
+        yield f"sphere {name}", f"diameter {sphere.diameter_mm:g} mm, U {sphere.expanded_uncertainty_mm:g} mm{certificate}"
+
+
+def _identity(calibration: Calibration) -> Iterator[tuple[str, str]]:
     yield "calibrated", f"{calibration.created_utc} by {calibration.software}"
     yield "robot model", "none: flange poses as the controller reports them" if calibration.model is None else calibration.model.name
     yield from _flat(calibration.identity, "")
     yield from ((f"input {key}", value) for key, value in _flat(calibration.inputs, ""))
-    yield from ((f"calibration session {name}", digest) for digest, name in names.items())
     if calibration.seen_joints_rad is not None:
         low, high = np.degrees(calibration.seen_joints_rad)
         yield "axis ranges used", ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in zip(low, high, strict=True))

@@ -129,7 +129,7 @@ def result_lead(verification: VerifyResult | None) -> str:
         return "No verification was given. The only honest figure of a calibration alone is its prediction of shots that were left out of the solve."
     unseen = " that the calibration never saw" if verification.held_out else ""
     places = len(verification.figures.spheres)
-    seen = f"{verification.used} of {verification.n_shots} shots{unseen}, at {places} place{'' if places == 1 else 's'} of spheres"
+    seen = f"{verification.used} of {verification.n_shots} shots{unseen}, of {places} sphere{'' if places == 1 else 's'}"
     if verification.before is None:
         return f"Figures on {seen}. The cell file has no first guess of the hand-eye, so there is no uncalibrated system to compare with."
     return f"Figures on {seen}. Uncalibrated: nominal robot and first guess of the hand-eye."

@@ -110,7 +110,7 @@ def figures_of(views: Sequence[SphereView], sizes: Mapping[str, SphereSize], *, 
     """
     if not views:
         raise DataError("no shot shows a sphere", remedy="Capture shots of the spheres, or see why they were rejected.")
-    names = list(dict.fromkeys(view.sphere for view in views))
+    names = sorted({view.sphere for view in views})
     by_sphere = {name: [view for view in views if view.sphere == name] for name in names}
     spheres = {name: _sphere_figures(name, members, sizes[name]) for name, members in by_sphere.items()}
     rows = [row for name, members in by_sphere.items() for row in _view_figures(members, sizes[name], spheres[name], line_profile=line_profile)]
