@@ -42,13 +42,10 @@ def write_recording(path: str | Path, scene: Scene) -> Path:
     Raises:
         FileError: the folder is missing or not writable.
     """
-    import rerun as rr
-
     target = Path(path)
     temporary = _temporary_beside(target)
     try:
-        stream = rr.RecordingStream("spherecal")
-        stream.save(temporary, default_blueprint=_layout(scene))
+        stream = _stream_to(temporary, scene)
         _log_static(stream, scene)
         for number, step in enumerate(scene.steps):
             stream.set_time(TIMELINE, sequence=number)
@@ -61,6 +58,17 @@ def write_recording(path: str | Path, scene: Scene) -> Path:
             os.unlink(temporary)
         raise
     return target
+
+
+def _stream_to(path: Path, scene: Scene) -> rr.RecordingStream:
+    import rerun as rr
+
+    stream = rr.RecordingStream("spherecal")
+    try:
+        stream.save(path, default_blueprint=_layout(scene))
+    except (OSError, RuntimeError) as error:
+        raise FileError(f"cannot be written ({error})", file=path, remedy="Check that the folder is writable and has room.") from error
+    return stream
 
 
 def _temporary_beside(target: Path) -> Path:
