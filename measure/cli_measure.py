@@ -58,6 +58,7 @@ def comparison_rows(result: VerifyResult) -> list[list[object]]:
     rows: list[list[object]] = [
         ["scatter of a sphere's centre between views (rms)", before and before.centre_rms_mm, after.centre_rms_mm],
         ["worst single view", before and before.centre_max_mm, after.centre_max_mm],
+        ["distance of all points from the sphere (rms)", before and before.radial_rms_mm, after.radial_rms_mm],
     ]
     if lengths_after:
         rows.append([f"error of {len(lengths_after)} lengths between spheres (rms)", _rms(lengths_before), _rms(lengths_after)])
@@ -65,7 +66,7 @@ def comparison_rows(result: VerifyResult) -> list[list[object]]:
     if after.spheres:
         diameters_before = [sphere.diameter_error_mm for sphere in before.spheres.values()] if before else []
         rows.append(["error of a sphere's diameter (worst)", _worst(diameters_before), _worst([s.diameter_error_mm for s in after.spheres.values()])])
-    return rows
+    return [row for row in rows if row[1] is not None or row[2] is not None]
 
 
 def tell_rejected(console: Console, rejected: list[tuple[str, int, str]]) -> None:

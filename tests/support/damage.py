@@ -150,8 +150,8 @@ DAMAGES: Mapping[str, Damage] = {
     "unknown key": Damage(unknown_key, "cell.yaml", "spehres", ("spehres",)),
     "broken YAML": Damage(broken_yaml, "cell.yaml", "line", ("yaml", "expected", "found")),
     "broken JSON line": Damage(broken_json, "shots.jsonl", "line 2", ("json",)),
-    "empty session": Damage(no_shots, "", "", ("shot",)),
+    "empty session": Damage(no_shots, "shots.jsonl", "", ("no shot",)),
     "non-rigid hand-eye": Damage(bent_hand_eye, "cell.yaml", "flange_from_camera", ("rigid",)),
-    "scans in metres": Damage(metres, ".ply", "", ("metre",)),
+    "scans in metres": Damage(metres, "scans", "", ("metre",)),
     "joints in degrees": Damage(degrees, "shots.jsonl", "", ("degree",)),
 }

@@ -32,6 +32,14 @@ def test_the_same_result_again_leaves_one_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_the_same_content_at_another_time_leaves_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(f"format: {FORMAT}\nid: abc\ncreated_utc: 1\n")
+    with replacing(path, FORMAT):
+        path.write_text(f"format: {FORMAT}\nid: abc\ncreated_utc: 2\n")
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_failure_brings_the_earlier_result_back(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text(OLD)

@@ -1,0 +1,175 @@
+"""The run as an operator drives it: asked before it moves, stopped by Ctrl-C, resumed, stepped through."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from acquire.cell import load_cell
+from acquire.plan import load_plan, write_plan
+from drivers.files.session import read_session
+from tests.system.conftest import Cli, SmallCell
+
+N_POSES = 4
+
+
+def real_time_cell(small: SmallCell, folder: Path, speed_rad_s: float, settle_s: float = 0.1) -> tuple[Path, Path]:
+    """A copy of the small cell that takes the time a robot takes, and a short plan for it."""
+    text = small.cell.read_text()
+    truth = f"truth: {small.folder / 'truth.yaml'}"
+    text = text.replace("truth: truth.yaml", f"{truth}, instant: false")
+    text = text.replace("speed_rad_s: 0.5, settle_s: 0.5", f"speed_rad_s: {speed_rad_s}, settle_s: {settle_s}")
+    cell = folder / "cell.yaml"
+    cell.write_text(text)
+    plan = load_plan(small.folder / "calibration_plan.yaml")
+    short = type(plan)(load_cell(cell).sha256, plan.purpose, plan.poses[:N_POSES])
+    write_plan(short, folder / "plan.yaml")
+    return cell, folder / "plan.yaml"
+
+
+def started(arguments: Sequence[object], **streams: int) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "measure.cli", "capture", *(str(argument) for argument in arguments)]
+    given = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
+    return subprocess.Popen(command, text=True, **given)  # type: ignore[call-overload,no-any-return]
+
+
+def test_a_dry_run_lists_the_poses_and_touches_nothing(small: SmallCell, tmp_path: Path, cli: Cli) -> None:
+    result = cli("capture", small.cell, small.folder / "workpiece_plan.yaml", "-o", tmp_path / "s", "--dry-run")
+    assert result.code == 0
+    assert "nothing was moved" in result.out
+    assert max(len(line) for line in result.out.splitlines()) <= 80
+    told = cli("capture", small.cell, small.folder / "workpiece_plan.yaml", "-o", tmp_path / "s", "--dry-run", "--json").told
+    assert (told["n_shots"], told["state"]) == (0, "dry_run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_is_not_overwritten(small: SmallCell, cli: Cli) -> None:
+    before = read_session(small.workpiece_session).digest
+    result = cli("capture", small.cell, small.folder / "workpiece_plan.yaml", "-o", small.workpiece_session, "--yes", "--json")
+    assert result.code == 1
+    assert "--resume" in result.told["error"]["remedy"]
+    assert read_session(small.workpiece_session).digest == before
+
+
+def test_resuming_a_complete_session_adds_nothing(small: SmallCell, cli: Cli) -> None:
+    before = read_session(small.workpiece_session).digest
+    told = cli("capture", small.cell, small.folder / "workpiece_plan.yaml", "-o", small.workpiece_session, "--resume", "--json").told
+    assert told["state"] == "complete"
+    assert read_session(small.workpiece_session).digest == before
+
+
+def test_a_moving_robot_needs_somebody_who_says_so(small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 1.0)
+    for option in ([], ["--step"]):
+        process = started([cell, plan, "-o", tmp_path / "s", *option])
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 1
+        assert err.count("\n") == 1
+        assert "--yes" in err
+        assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize(("typed", "code"), [("yes\n", 1), ("move\n", 0)])
+def test_the_motion_is_confirmed_by_a_typed_word(typed: str, code: int, small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 8.0, 0.05)
+    ours, theirs = pty.openpty()
+    process = started([cell, plan, "-o", tmp_path / "s"], stdin=theirs, stderr=theirs)
+    os.close(theirs)
+    shown = read_until(ours, b"to start:")
+    os.write(ours, typed.encode())
+    shown += read_until(ours, None)
+    process.communicate(timeout=60)
+    os.close(ours)
+    assert b"4 poses at up to 8 rad/s" in shown
+    assert process.returncode == code, shown
+    if code == 0:
+        assert b"points" in shown  # the live table
+        assert len(read_session(tmp_path / "s").shots) == N_POSES
+    else:
+        assert not (tmp_path / "s").exists()
+
+
+def test_step_by_step_a_pose_is_taken_skipped_or_the_end(small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 8.0, 0.05)
+    ours, theirs = pty.openpty()
+    process = started([cell, plan, "-o", tmp_path / "s", "--step", "--json"], stdin=theirs, stderr=theirs)
+    os.close(theirs)
+    for answer in (b"\n", b"s\n", b"\n", b"q\n"):
+        read_until(ours, b"q ends the run:")
+        os.write(ours, answer)
+    read_until(ours, None)
+    out, _ = process.communicate(timeout=60)
+    os.close(ours)
+    told = json.loads(out)
+    assert (told["n_shots"], told["n_skipped"], told["state"]) == (2, 1, "stopped")
+    assert process.returncode == 0
+
+
+def test_ctrl_c_ends_after_the_shot_and_the_run_can_be_resumed(small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 6.0, 0.05)
+    process = started([cell, plan, "-o", tmp_path / "s", "--yes", "--json"])
+    if process.stderr is None:
+        pytest.fail("no pipe")
+    process.stderr.readline()  # the first shot's line
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    told = json.loads(out)
+    assert told["state"] == "stopped"
+    assert 1 <= told["n_shots"] < N_POSES
+    assert "--resume" in err
+    process = started([cell, plan, "-o", tmp_path / "s", "--yes", "--json", "--resume"])
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert json.loads(out)["n_shots"] == N_POSES
+    assert [shot.index for shot in read_session(tmp_path / "s").shots] == list(range(N_POSES))
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
+def test_ctrl_c_twice_or_a_termination_stops_now_and_leaves_no_empty_session(signals: Sequence[int], small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 0.02)  # a minute to the first pose
+    process = started([cell, plan, "-o", tmp_path / "s", "--yes", "--json"])
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "s" / "shots.jsonl").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.3)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 130, err
+    assert json.loads(out)["error"]["type"] == "Interrupted"
+    assert err.splitlines()[-1] == "interrupted"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.yaml", "plan.yaml"]
+
+
+def test_a_cell_without_its_truth_leaves_no_session(small: SmallCell, tmp_path: Path, cli: Cli) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_bytes(small.cell.read_bytes())
+    result = cli("capture", cell, small.folder / "workpiece_plan.yaml", "-o", tmp_path / "s", "--yes", "--json")
+    assert result.code == 1
+    assert "truth.yaml" in result.told["error"]["file"]
+    assert list(tmp_path.iterdir()) == [cell]
+
+
+def read_until(descriptor: int, words: bytes | None) -> bytes:
+    """What a terminal shows until some words come, or to the end."""
+    shown = b""
+    while words is None or words not in shown:
+        try:
+            part = os.read(descriptor, 4096)
+        except OSError:  # the other side has closed its terminal
+            return shown
+        if not part:
+            return shown
+        shown += part
+    return shown
