@@ -34,7 +34,7 @@ system:
 	@PYTHON="$(PYTHON)" sh tools/environment.sh system
 
 demo: $(VENV)/.installed
-	$(BIN)/spherecal demo --out $(DEMO_OUT)
+	$(BIN)/spherecal demo --out $(DEMO_OUT) --force
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
