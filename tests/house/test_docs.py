@@ -40,6 +40,16 @@ def test_files_that_pages_name_exist() -> None:
     assert not missing
 
 
+def test_the_readme_names_every_command_and_no_other() -> None:
+    from typer.main import get_group
+
+    from measure.cli import app
+
+    verbs = set(get_group(app).commands)
+    named = set(re.findall(r"`spherecal ([a-z]+)", (ROOT / "README.md").read_text(encoding="utf-8")))
+    assert named == verbs
+
+
 def example(kind: str, containing: str) -> str:
     """A fenced example of the page on file formats."""
     text = (ROOT / "docs" / "file_formats.md").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What may import what, beyond the contracts of import-linter, and what `spherecal --help` may load."""
+"""What may import what, beyond the contracts of import-linter (what `spherecal --help` loads: tests/unit/measure/test_cli_help.py)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,7 @@ import pytest
 
 from tests.support.source import all_modules, dotted_name, imported_names, modules_of, string_constants
 
-HEAVY = ("open3d", "rerun", "numba", "matplotlib", "trimesh", "pandas", "scipy.optimize", "scipy.spatial", "scipy.interpolate")
-WEIGHTY_AT_IMPORT = ("open3d", "rerun", "matplotlib", "trimesh", "numba")
-
-HELP = """
-sys.argv = ['spherecal', '--help']
-from measure.cli import main
-try:
-    main()
-except SystemExit as done:
-    if done.code:
-        raise
-"""
+WEIGHTY = ("open3d", "rerun", "matplotlib", "trimesh", "numba")
 
 
 def loaded_by(code: str) -> set[str]:
@@ -34,12 +23,6 @@ def loaded_by(code: str) -> set[str]:
     return set(json.loads(done.stdout))
 
 
-def test_help_loads_nothing_heavy() -> None:
-    loaded = loaded_by(HELP)
-    assert "measure.cli" in loaded
-    assert not loaded & set(HEAVY)
-
-
 def test_the_probe_sees_a_heavy_import() -> None:
     assert "scipy.optimize" in loaded_by("import scipy.optimize")
 
@@ -49,7 +32,7 @@ def test_no_module_loads_a_weighty_library_by_being_imported() -> None:
     names = [dotted_name(path) for path in all_modules() if "kernels" not in path.stem and path.stem != "compiled"]
     loaded = loaded_by(f"import importlib\nfor name in {names!r}: importlib.import_module(name)")
     assert set(names) <= loaded
-    assert not loaded & set(WEIGHTY_AT_IMPORT)
+    assert not loaded & set(WEIGHTY)
 
 
 @pytest.mark.parametrize("path", all_modules(), ids=dotted_name)
