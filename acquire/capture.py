@@ -99,7 +99,7 @@ class RobotUnsettled(RobotTimeout):
     """The robot is at its target and does not come to rest."""
 
 
-class _Interrupted(Exception):  # noqa: N818 - no error: it unwinds a pose in hand
+class _Interrupted(Exception):
     def __init__(self, command: Pause | Skip | Stop) -> None:
         super().__init__()
         self.command = command

@@ -1,0 +1,1 @@
+"""Adapters of 3D cameras, one module each; none yet."""
