@@ -100,6 +100,8 @@ class RobotUnsettled(RobotTimeout):
 
 
 class _Interrupted(Exception):
+    """No error: it unwinds a pose in hand."""
+
     def __init__(self, command: Pause | Skip | Stop) -> None:
         super().__init__()
         self.command = command
