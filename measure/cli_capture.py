@@ -161,7 +161,9 @@ class RunTable:
         self._rows.append(row)
         if self._draw is None:
             pose, sphere, points, rms, remark = row
-            line = f"{self._place} pose {pose} sphere {sphere}: {points} points, rms {rms} mm{', ' if remark else ''}{remark}"
+            figures = f"{points} points, rms {rms} mm" if rms != "-" else f"{points} points" if points != "-" else ""
+            parts = [part for part in (figures, remark) if part]
+            line = f"{self._place} pose {pose}{'' if sphere == '-' else f' sphere {sphere}'}: {', '.join(parts)}"
             self._note(line if len(line) <= 80 else line[:77] + "...")
 
     def _left(self, n_left: int) -> str:
@@ -170,14 +172,16 @@ class RunTable:
 
     def _table(self) -> RenderableType:
         from rich.box import SIMPLE_HEAD
+        from rich.console import Group
         from rich.table import Table
+        from rich.text import Text
 
-        table = Table(box=SIMPLE_HEAD, caption=self._doing, caption_justify="left", pad_edge=False)
+        table = Table(box=SIMPLE_HEAD, pad_edge=False)
         for i, column in enumerate(("pose", "sphere", "points", "rms mm", "remark")):
             table.add_column(column, justify="right" if i in (2, 3) else "left")
         for row in self._rows:
             table.add_row(*row)
-        return table
+        return Group(table, Text(self._doing))
 
 
 def shot_row(event: Event) -> tuple[str, str, str, str, str]:
@@ -185,10 +189,11 @@ def shot_row(event: Event) -> tuple[str, str, str, str, str]:
     from acquire.events import Captured, Failed, Skipped
 
     match event:
-        case Captured(pose_id=pose, shot=shot, finding=finding, prediction_error_mm=error):
+        case Captured(pose_id=pose, shot=shot, finding=None, xyz_mm=xyz):
+            n_points = int((xyz[..., 2] == xyz[..., 2]).sum())  # without the NaN of the holes
+            return pose, shot.sphere or "-", str(n_points), "-", ""
+        case Captured(pose_id=pose, shot=shot, finding=finding, prediction_error_mm=error) if finding is not None:
             remark = "" if error is None else f"{error:.1f} mm from its predicted place"
-            if finding is None:
-                return pose, shot.sphere or "-", "-", "-", remark
             return pose, shot.sphere or "-", str(finding.n_points), f"{finding.rms_mm:.3f}", remark
         case Failed(pose_id=pose, shot=shot, reason=reason):
             return pose, shot.sphere or "-", "-", "-", f"failed: {reason}"

@@ -17,7 +17,7 @@ from drivers.files.yaml import dump_yaml
 from drivers.kinematics.se3 import FloatArray
 
 ROBOT_MODEL = "irb1410_paper"
-RESOLUTION_PX = (512, 320)
+RESOLUTION_PX = (448, 280)
 TABLE_TOP_MM = 60.0
 DIAMETER_MM = 38.1
 DIAMETER_U_MM = 0.001
@@ -90,7 +90,7 @@ def _cell_data(rng: np.random.Generator) -> dict[str, object]:
             for name, centre in centres.items()
         },
         "lengths": _lengths(centres, rng),
-        "limits": {"centre_rms_mm": 0.2, "length_error_mm": 0.2, "diameter_error_mm": 0.1, "form_mm": 0.3},
+        "limits": {"centre_rms_mm": 0.2, "length_error_mm": 0.2, "diameter_error_mm": 0.2, "form_mm": 0.4},
         "work_volume_mm": [[650, -300, 100], [1150, 300, 600]],
         "obstacles": [{"name": "table", "kind": "box", "centre_in_base_mm": [900, 0, TABLE_TOP_MM - 20], "size_mm": [1200, 1600, 40]}],
         "motion": {"speed_rad_s": 0.5, "settle_s": 0.5, "frames": 1},
