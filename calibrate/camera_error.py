@@ -117,52 +117,62 @@ class PillowError:
 
 @dataclass(frozen=True, slots=True)
 class PolynomialError:
-    """A depth field dz(x, y, z) in Legendre polynomials over a box of the camera frame, by total degree.
+    """A smooth field in Legendre polynomials over a box of the camera frame, by total degree.
 
-    Degree 1 without the constant is `affine`, degree 3 is `field`. The constant is left out: it is a shift along the
-    optical axis, which the hand-eye transform already holds. The prior falls with the degree, so that a field is smooth
-    unless the data want it otherwise.
+    Depth gets all terms up to `degree`, x and y those up to `lateral_degree`: wrong focal lengths and principal points
+    move points sideways as well (0.04 mm at the edge of the view for a focal length wrong by 0.25 per mille), and a
+    depth-only field leaves that in the lengths. Constants are left out: they are shifts that the hand-eye transform
+    holds already. The prior falls with the degree, so that a field is smooth unless the data want it otherwise.
     """
 
     centre_mm: tuple[float, float, float]
     half_size_mm: tuple[float, float, float]
     degree: int
-    smoothness: float = 1.0
-    """Prior size of a first-degree coefficient in mm; degree d is divided by d."""
+    lateral_degree: int = 0
+    smoothness_mm: float = 1.0
+    """Prior size of a first-degree depth coefficient; degree d is divided by d."""
+    lateral_smoothness_mm: float = 0.3
+    """The same across the view."""
     name: str = "field"
 
     @property
-    def exponents(self) -> tuple[tuple[int, int, int], ...]:
-        """Degrees (in x, y, z) of every term, lowest total degree first."""
-        degrees = range(self.degree + 1)
-        triples = [(i, j, k) for i, j, k in product(degrees, degrees, degrees) if 0 < i + j + k <= self.degree]
-        return tuple(sorted(triples, key=lambda t: (sum(t), t)))
+    def terms(self) -> tuple[tuple[int, tuple[int, int, int]], ...]:
+        """Axis moved and degrees in x, y, z of every term."""
+        return tuple((2, t) for t in _degrees(self.degree)) + tuple((axis, t) for axis in (0, 1) for t in _degrees(self.lateral_degree))
 
     @property
     def axis(self) -> NDArray[np.int64]:
-        """Every term acts on depth."""
-        return np.full(len(self.exponents), 2, dtype=np.int64)
+        """Depth terms first, then x, then y."""
+        return np.array([axis for axis, _ in self.terms], dtype=np.int64)
 
     @property
     def prior_sigma_mm(self) -> FloatArray:
         """Falls as 1 / total degree."""
-        return np.array([self.smoothness / sum(t) for t in self.exponents])
+        return np.array([(self.smoothness_mm if axis == 2 else self.lateral_smoothness_mm) / sum(t) for axis, t in self.terms])
 
     def basis(self, points_in_camera_mm: ArrayLike) -> FloatArray:
         """(n, k) products of Legendre polynomials; linear beyond the box, so that extrapolation stays tame."""
         points = np.asarray(points_in_camera_mm, dtype=np.float64)
         scaled = (points - np.asarray(self.centre_mm)) / np.asarray(self.half_size_mm)
-        legendre = _legendre_tame(scaled, self.degree)
-        return np.stack([legendre[i][:, 0] * legendre[j][:, 1] * legendre[k][:, 2] for i, j, k in self.exponents], axis=-1)
+        legendre = _legendre_tame(scaled, max(self.degree, self.lateral_degree))
+        result = np.empty((len(points), len(self.terms)))
+        products: dict[tuple[int, int, int], FloatArray] = {}
+        for column, (_, (i, j, k)) in enumerate(self.terms):
+            if (i, j, k) not in products:
+                products[i, j, k] = legendre[i][:, 0] * legendre[j][:, 1] * legendre[k][:, 2]
+            result[:, column] = products[i, j, k]
+        return result
 
     def settings(self) -> dict[str, object]:
-        """Box, degree and smoothness."""
+        """Box, degrees and smoothness."""
         return {
             "model": self.name,
             "centre_mm": list(self.centre_mm),
             "half_size_mm": list(self.half_size_mm),
             "degree": self.degree,
-            "smoothness": self.smoothness,
+            "lateral_degree": self.lateral_degree,
+            "smoothness_mm": self.smoothness_mm,
+            "lateral_smoothness_mm": self.lateral_smoothness_mm,
         }
 
 
@@ -192,9 +202,9 @@ def camera_error_models(names: Sequence[str], *, points_in_camera_mm: FloatArray
     half = tuple(float(max(h, 20.0)) for h in (upper - lower) / 2)
     made: dict[str, CameraError] = {
         "none": NoCameraError(),
-        "affine": PolynomialError((centre[0], centre[1], centre[2]), (half[0], half[1], half[2]), 1, name="affine"),
+        "affine": PolynomialError((centre[0], centre[1], centre[2]), (half[0], half[1], half[2]), 1, 1, name="affine"),
         "pillow": PillowError(sight_crossing_mm),
-        "field": PolynomialError((centre[0], centre[1], centre[2]), (half[0], half[1], half[2]), 3, name="field"),
+        "field": PolynomialError((centre[0], centre[1], centre[2]), (half[0], half[1], half[2]), 3, 2, name="field"),
     }
     unknown = [name for name in names if name not in made]
     if unknown:
@@ -215,7 +225,9 @@ def camera_error_from_settings(settings: Mapping[str, object], *, file: str | No
                     _triple(settings["centre_mm"]),
                     _triple(settings["half_size_mm"]),
                     int(str(settings["degree"])),
-                    float(str(settings["smoothness"])),
+                    int(str(settings["lateral_degree"])),
+                    float(str(settings["smoothness_mm"])),
+                    float(str(settings["lateral_smoothness_mm"])),
                     str(name),
                 )
             case other:
@@ -224,6 +236,12 @@ def camera_error_from_settings(settings: Mapping[str, object], *, file: str | No
         raise FileError(
             f"not a camera error model: {error}", file=file, where="camera_error", remedy="Calibrate again to write a whole file."
         ) from error
+
+
+def _degrees(highest: int) -> list[tuple[int, int, int]]:
+    """Degrees in x, y, z of all terms of total degree 1 to `highest`, lowest first."""
+    each = range(highest + 1)
+    return sorted(((i, j, k) for i, j, k in product(each, each, each) if 0 < i + j + k <= highest), key=lambda t: (sum(t), t))
 
 
 def _legendre_tame(x: FloatArray, degree: int) -> list[FloatArray]:

@@ -9,6 +9,7 @@ import numpy as np
 from calibrate.clouds import Solution
 from calibrate.normal import symmetric_inverse
 from calibrate.problem import Layout, Problem
+from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 ANGLE_SCALE_MM = 500.0
@@ -48,11 +49,24 @@ def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
     return Identifiability(
         rank=rank,
         n_parameters=n,
-        expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera,
+        expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera - camera_gauge(problem),
         condition=float(singular[0] / singular[rank - 1]),
         gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if rank < n else float("inf"),
         singular_values=singular,
     )
+
+
+def camera_gauge(problem: Problem) -> int:
+    """Number of directions in which the camera error model only repeats the hand-eye transform (lateral terms turn the view)."""
+    lower, upper = problem.points_in_camera_mm.min(axis=0), problem.points_in_camera_mm.max(axis=0)
+    points = np.random.default_rng(3).uniform(lower, upper, (200, 3))
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), (200, 3, 3)), -se3.hat(points) / ANGLE_SCALE_MM], axis=-1)
+    basis, axis = problem.camera_error.basis(points), problem.camera_error.axis
+    camera = np.zeros((200, 3, len(axis)))
+    camera[:, axis, np.arange(len(axis))] = basis
+    fields = np.concatenate([rigid, camera], axis=-1).reshape(600, -1)
+    singular = np.linalg.svd(fields, compute_uv=False)
+    return int(fields.shape[1] - (singular > 1e-9 * singular[0]).sum())
 
 
 def parameter_scale(layout: Layout) -> FloatArray:
