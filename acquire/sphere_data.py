@@ -31,7 +31,7 @@ Reason = Literal[
 """Why a sphere or an arc was refused."""
 
 
-class SphereNotFound(DataError):  # noqa: N818 - named like the rest of the tree
+class SphereNotFound(DataError):
     """A scan in which the sphere cannot be found, or not well enough to be used."""
 
     def __init__(self, reason: Reason, message: str, *, remedy: str) -> None:
@@ -54,9 +54,9 @@ class SphereSettings:
     """Share of the directions round the line of sight in which the cap has points."""
     max_radius_error_mm: float = 1.0
     max_radius_error_share: float = 0.05
-    """The free radius may be off by `max_radius_error_mm + share * radius`, and by five of its own sigmas."""
-    max_rms_mm: float = 1.0
-    max_rms_share: float = 0.08
+    """The free radius may be off by `max_radius_error_mm + share * radius`, and by five sigmas of its noise."""
+    max_rms_mm: float = 0.6
+    max_rms_share: float = 0.06
     """The residual rms may be the smaller of `max_rms_mm` and `share * radius`."""
     min_visible_share: float = 0.25
     """Of the points seen where the cap should be, the share that lies on it."""

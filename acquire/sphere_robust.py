@@ -18,9 +18,13 @@ from drivers.errors import DataError
 
 LOOK_REMEDY = "Look at the scan: is the sphere in view, in focus, and its diameter in the cell file right?"
 
+_CLEAR_REMEDY = "Something else is in the way, or the camera is far out of its working range."
+
 # a form error is smooth: over the cap it averages like about a dozen independent patches, however many points there are
 _FORM_PATCHES = 12.0
 _GATE_FLOOR_MM = 0.005
+_BEND_MM = 0.3
+_BEND_SHARE = 0.02
 _WIDE_STEPS = 3
 _NARROW_STEPS = 14
 _ENOUGH = 6000
@@ -49,9 +53,10 @@ def fit_and_judge(start: FloatArray, scan: ValidPoints, radius_mm: float, settin
     centre, covariance = fit_fixed_radius(chosen, radius_mm, fit.centre)
     half_angle, coverage = _cap(chosen, centre)
     _check_cap(half_angle, coverage, settings)
-    free_radius = _checked_radius(chosen, centre, radius_mm, settings)
+    _check_round(chosen, centre, radius_mm, facing)
+    free_radius = _checked_radius(chosen, centre, radius_mm, settings, fit.noise_mm)
     rms = float(np.sqrt(np.mean((np.linalg.norm(chosen - centre, axis=1) - radius_mm) ** 2)))
-    _check_rms(rms, radius_mm, settings)
+    _check_rms(rms, fit.noise_mm, radius_mm, settings)
     form_variance = max(rms**2 - fit.noise_mm**2, 0.0)
     inflation = (fit.noise_mm**2 + form_variance * max(len(chosen) / _FORM_PATCHES, 1.0)) / max(rms**2, 1e-18)
     return SphereFinding(
@@ -74,7 +79,7 @@ def _robust_fit(points: FloatArray, start: FloatArray, radius_mm: float, setting
 
     Large clouds are first fitted on a part of their points, which gives start and gate for all of them.
     """
-    gate = float(np.clip(0.08 * radius_mm, 0.8, 2.5))
+    gate = _shell_mm(radius_mm)
     rng = np.random.default_rng(settings.seed)
     few = thinned(points, _ENOUGH, rng)
     centre, selected = start, np.zeros(0, dtype=np.int64)
@@ -82,22 +87,31 @@ def _robust_fit(points: FloatArray, start: FloatArray, radius_mm: float, setting
         selected = _within_shell(few, centre, radius_mm, gate, settings, facing)
         centre = _step(few, selected, centre, radius_mm)
     _check_curved(few, selected, centre, radius_mm, settings, facing)
-    fit = _narrow(few, _Fit(centre, selected, gate), radius_mm, settings, facing)
+    fit = _narrow(few, _Fit(centre, selected, gate), gate, radius_mm, settings, facing)
     if len(few) == len(points):
         return fit
     wide = _within_shell(points, fit.centre, radius_mm, gate, settings, facing)
-    return _narrow(points, _Fit(fit.centre, wide, fit.noise_mm), radius_mm, settings, facing)
+    return _narrow(points, _Fit(fit.centre, wide, fit.noise_mm), 1.5 * settings.gate_sigmas * fit.noise_mm, radius_mm, settings, facing)
 
 
-def _narrow(points: FloatArray, fit: _Fit, radius_mm: float, settings: SphereSettings, facing: float) -> _Fit:
-    """From a wide selection to one within some sigmas of the smooth form, repeated until it stays the same."""
-    gate = settings.gate_sigmas * fit.noise_mm
-    centre, selected, noise = fit.centre, fit.selected, fit.noise_mm
+def _shell_mm(radius_mm: float) -> float:
+    """How far from the ideal sphere a point may be at first."""
+    return float(np.clip(0.08 * radius_mm, 0.5, 2.5))
+
+
+def _narrow(points: FloatArray, fit: _Fit, gate_mm: float, radius_mm: float, settings: SphereSettings, facing: float) -> _Fit:
+    """From a wide selection to one within some sigmas of the smooth form, repeated until it stays the same.
+
+    The gate never opens again: a second surface in the selection would widen it step by step and draw the fit away.
+    """
+    gate, centre, selected, noise = gate_mm, fit.centre, fit.selected, fit.noise_mm
     for step in range(_NARROW_STEPS):
         before = selected
-        selected, noise = _within_noise(points, before, centre, radius_mm, gate, settings, facing)
+        deviation, noise = _deviation(points, before, centre, radius_mm, settings, facing)
+        gate = min(gate, max(settings.gate_sigmas * noise, 0.5 * gate if step < 3 else 0.0, _GATE_FLOOR_MM))
+        selected = np.flatnonzero(deviation < gate)
+        _check_count(selected, len(before), settings)
         centre = _step(points, selected, centre, radius_mm)
-        gate = max(settings.gate_sigmas * noise, 0.5 * gate if step < 3 else 0.0, _GATE_FLOOR_MM)
         if step > 3 and np.array_equal(before, selected):
             break
     return _Fit(centre=centre, selected=selected, noise_mm=noise)
@@ -112,15 +126,45 @@ def _check_curved(
     """
     from acquire.sphere_fit_kernels import form_normal, shape
 
-    normal, right = form_normal(shape(points, centre, _across(centre), radius_mm, facing), selected)
-    form = np.linalg.solve(normal + 1e-9 * len(selected) * np.eye(6), right)
+    form = _form(*form_normal(shape(points, centre, _across(centre), radius_mm, facing), selected))
     curvature = radius_mm - float(form[3] + form[5])
     if curvature >= 0.4 * radius_mm:
         return
     if curvature < 0.15 * radius_mm:
         raise SphereNotFound("no_sphere", f"the surface nearest to a sphere of radius {radius_mm:.3f} mm is flat or nearly so", remedy=LOOK_REMEDY)
     # curved, but less: the gate on the free radius says by how much
-    _checked_radius(points[selected], centre, radius_mm, settings)
+    _checked_radius(points[selected], centre, radius_mm, settings, 0.0)
+
+
+def _check_round(points: FloatArray, centre: FloatArray, radius_mm: float, facing: float) -> None:
+    """Refuse what bends rightly in one direction only: a pipe of the sphere's radius leaves `R b² / 2` along its axis."""
+    from acquire.sphere_fit_kernels import form_normal, shape
+
+    form = _form(*form_normal(shape(points, centre, _across(centre), radius_mm, facing), np.arange(len(points))))
+    bends = np.linalg.eigvalsh(np.array([[form[3], form[4] / 2], [form[4] / 2, form[5]]]))
+    if np.abs(bends).max() > 0.2 * radius_mm + 2 * _BEND_MM:
+        raise SphereNotFound(
+            "radius",
+            f"the surface bends with radii of {_radius_text(radius_mm, bends[0])} one way and {_radius_text(radius_mm, bends[1])} the other, "
+            f"certified is a sphere of {radius_mm:.2f} mm",
+            remedy=LOOK_REMEDY,
+        )
+
+
+def _radius_text(radius_mm: float, bend_mm: float) -> str:
+    curvature = radius_mm - 2 * bend_mm
+    return f"{radius_mm**2 / curvature:.1f} mm" if curvature > 0.02 * radius_mm else "no end"
+
+
+def _form(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """The quadratic form (6,) of normal equations; where few points leave one of its terms open, that stays small."""
+    return np.asarray(np.linalg.solve(normal + 1e-9 * normal[0, 0] * np.eye(6), right))
+
+
+def _limited(form: FloatArray, radius_mm: float) -> FloatArray:
+    """A form that bends no more than cameras do: else it would follow a table or a pipe that touches the cap."""
+    allowed = _BEND_MM + _BEND_SHARE * radius_mm
+    return form * min(1.0, allowed / max(float(np.abs(form).max()), 1e-12))
 
 
 def _within_shell(
@@ -136,22 +180,17 @@ def _within_shell(
     return selected
 
 
-def _within_noise(
-    points: FloatArray, before: IntArray, centre: FloatArray, radius_mm: float, gate_mm: float, settings: SphereSettings, facing: float
-) -> tuple[IntArray, float]:
-    """Rows of the points within a gate of the smooth form of those selected before, and the robust sigma about it."""
+def _deviation(
+    points: FloatArray, before: IntArray, centre: FloatArray, radius_mm: float, settings: SphereSettings, facing: float
+) -> tuple[FloatArray, float]:
+    """How far points (n,) are from the smooth form of those selected before, inf where grazing; robust sigma about it."""
     from acquire.sphere_fit_kernels import form_normal, shape, without_form
 
     shaped = shape(points, centre, _across(centre), radius_mm, facing)
-    normal, right = form_normal(shaped, before)
-    form = np.linalg.solve(normal + 1e-9 * len(before) * np.eye(6), right)
-    rough = without_form(shaped, np.asarray(form, dtype=np.float64))
-    middle = float(np.median(rough[before]))
-    noise = 1.4826 * float(np.median(np.abs(rough[before] - middle)))
-    inside = (np.abs(rough - middle) < min(gate_mm, max(settings.gate_sigmas * noise, _GATE_FLOOR_MM, 0.5 * gate_mm)))
-    selected = np.flatnonzero(inside & (shaped[:, 1] >= np.cos(settings.max_incidence_rad)))
-    _check_count(selected, len(before), settings)
-    return selected, noise
+    rough = without_form(shaped, _limited(_form(*form_normal(shaped, before)), radius_mm))
+    deviation = np.abs(rough - np.median(rough[before]))
+    noise = 1.4826 * float(np.median(deviation[before]))
+    return np.where(shaped[:, 1] >= np.cos(settings.max_incidence_rad), deviation, np.inf), noise
 
 
 def _step(points: FloatArray, selected: IntArray, centre: FloatArray, radius_mm: float) -> FloatArray:
@@ -218,12 +257,15 @@ def _check_cap(half_angle_rad: float, coverage: float, settings: SphereSettings)
         )
 
 
-def _checked_radius(points: FloatArray, centre: FloatArray, radius_mm: float, settings: SphereSettings) -> float:
+def _checked_radius(points: FloatArray, centre: FloatArray, radius_mm: float, settings: SphereSettings, noise_mm: float) -> float:
     try:
-        _, free_radius, covariance = fit_free_radius(points, radius_mm, centre)
+        free_centre, free_radius, covariance = fit_free_radius(points, radius_mm, centre)
     except DataError as error:
-        raise SphereNotFound("radius", f"the surface found is flat, certified radius is {radius_mm:.2f} mm", remedy=LOOK_REMEDY) from error
-    allowed = settings.max_radius_error_mm + settings.max_radius_error_share * radius_mm + 5 * float(np.sqrt(covariance[3, 3]))
+        raise SphereNotFound("no_sphere", f"the surface nearest to a sphere of radius {radius_mm:.3f} mm is flat", remedy=LOOK_REMEDY) from error
+    residual = np.linalg.norm(points - free_centre, axis=1) - free_radius
+    # what noise alone does to a free radius; a bad fit must not widen its own gate
+    sigma = float(np.sqrt(covariance[3, 3]) * min(noise_mm / max(residual.std(), 1e-12), 1.0))
+    allowed = settings.max_radius_error_mm + settings.max_radius_error_share * radius_mm + 5 * sigma
     if abs(free_radius - radius_mm) > allowed:
         raise SphereNotFound(
             "radius",
@@ -233,11 +275,16 @@ def _checked_radius(points: FloatArray, centre: FloatArray, radius_mm: float, se
     return free_radius
 
 
-def _check_rms(rms_mm: float, radius_mm: float, settings: SphereSettings) -> None:
+def _check_rms(rms_mm: float, noise_mm: float, radius_mm: float, settings: SphereSettings) -> None:
     allowed = min(settings.max_rms_mm, settings.max_rms_share * radius_mm)
     if rms_mm > allowed:
         raise SphereNotFound(
             "residual",
             f"the points lie {rms_mm:.3f} mm rms from a sphere of radius {radius_mm:.2f} mm, {allowed:.3f} mm is allowed",
-            remedy="Something else is in the way, or the camera is far out of its working range.",
+            remedy=_CLEAR_REMEDY,
+        )
+    # points spread evenly over the shell have a robust sigma of 0.74 of its half-width: no surface is there
+    if noise_mm > 0.4 * _shell_mm(radius_mm):
+        raise SphereNotFound(
+            "residual", f"the points scatter by {noise_mm:.3f} mm about a radius of {radius_mm:.2f} mm: no surface is there", remedy=_CLEAR_REMEDY
         )

@@ -34,6 +34,25 @@ def plane_range_mm(sight: FloatArray, point_mm: ArrayLike, normal: ArrayLike) ->
     return np.where(distance > 0, distance, np.inf)
 
 
+def box_range_mm(sight: FloatArray, centre_mm: ArrayLike, half_size_mm: ArrayLike) -> FloatArray:
+    """Distance along each line of sight to a box along the camera's axes, inf where it misses."""
+    centre, half = np.asarray(centre_mm, dtype=np.float64), np.asarray(half_size_mm, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        one, other = (centre - half) / sight, (centre + half) / sight
+    near, far = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    return np.where((near < far) & (near > 0), near, np.inf)
+
+
+def pipe_range_mm(sight: FloatArray, centre_mm: ArrayLike, radius_mm: float, length_mm: float) -> FloatArray:
+    """Distance along each line of sight to a pipe along y, inf where it misses (no lids)."""
+    centre = np.asarray(centre_mm, dtype=np.float64)
+    across = np.array([1.0, 0.0, 1.0])
+    a, b = (sight**2) @ across, (sight * centre) @ across
+    discriminant = b**2 - a * ((centre**2) @ across - radius_mm**2)
+    distance = np.where(discriminant > 0, (b - np.sqrt(np.maximum(discriminant, 0))) / a, np.inf)
+    return np.where(np.abs(np.where(np.isfinite(distance), distance, 0) * sight[..., 1] - centre[1]) < length_mm / 2, distance, np.inf)
+
+
 def frame(
     spheres: Sequence[tuple[ArrayLike, float]],
     *,

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from acquire.sphere import Reason, SphereFinding, SphereNotFound, SphereSettings, find_sphere, find_spheres
 from drivers.errors import DataError
 from drivers.kinematics import se3
-from tests.support.scenes import cap, frame, plane_range_mm, rays, sphere_range_mm
+from tests.support.random_scenes import random_scene
+from tests.support.scenes import cap, frame, pipe_range_mm, plane_range_mm, rays, sphere_range_mm
 
 CENTRE = np.array([20.0, -15.0, 330.0])
 RADIUS = 19.05
@@ -220,3 +221,19 @@ def test_half_a_sphere_is_enough(hidden: float) -> None:
     finding = find_sphere(points[points[:, 0] > share], radius_mm=RADIUS)
     assert error_mm(finding) < 0.03
     assert finding.azimuth_coverage < 0.95
+
+
+def test_random_clutter() -> None:
+    # the first of the scenes of tests/qualify/test_sphere.py
+    for seed in range(12):
+        scene = random_scene(seed)
+        if scene.hidden < 0.5:
+            finding = find_sphere(scene.xyz_mm, radius_mm=scene.radius_mm, predicted_centre_in_camera_mm=scene.predicted_mm)
+            assert error_mm(finding, scene.centre_mm) < max(0.03, 7 * finding.centre_sigma_mm)
+        bare = random_scene(seed, with_sphere=False)
+        assert reason_of(bare.xyz_mm, bare.radius_mm, predicted_centre_in_camera_mm=bare.predicted_mm) != "ambiguous"
+
+
+def test_a_pipe_of_the_same_radius_is_no_sphere() -> None:
+    xyz = frame([], surfaces=[table(380), pipe_range_mm(SIGHT, CENTRE, RADIUS, 80.0)])
+    assert reason_of(xyz) in {"radius", "no_sphere"}
