@@ -134,6 +134,8 @@ def _log_to_stderr(debug: bool, quiet: bool) -> Iterator[None]:
     root, former = logging.getLogger(), logging.getLogger().level
     root.addHandler(handler)
     root.setLevel(logging.DEBUG if debug else logging.ERROR if quiet else logging.WARNING)
+    # warnings of Python and numpy speak to developers; ours to users are log records
+    logging.getLogger("py.warnings").setLevel(logging.WARNING if debug else logging.ERROR)
     for chatty in ("numba", "matplotlib", "PIL", "trimesh"):
         logging.getLogger(chatty).setLevel(logging.WARNING)
     logging.captureWarnings(True)

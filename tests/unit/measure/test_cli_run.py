@@ -133,7 +133,7 @@ def test_usage_errors_are_exit_2_and_one_line(capfd: pytest.CaptureFixture[str])
     assert json.loads(capfd.readouterr().out)["error"]["type"] == "UsageError"
 
 
-def test_warnings_and_log_lines_go_to_stderr_each_in_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+def test_log_lines_go_to_stderr_each_in_one_line_and_python_warnings_with_debug_only(capfd: pytest.CaptureFixture[str]) -> None:
     handlers, level = list(logging.getLogger().handlers), logging.getLogger().level
 
     def body(run: Run) -> None:
@@ -141,14 +141,16 @@ def test_warnings_and_log_lines_go_to_stderr_each_in_one_line(capfd: pytest.Capt
             warnings.simplefilter("default")
             warnings.warn("first\nsecond", stacklevel=1)
         logging.getLogger("acquire.test").warning("torn line\nrepaired")
-        logging.getLogger("acquire.test").info("not shown")
+        logging.getLogger("acquire.test").debug("not shown")
         run.finish({})
 
     assert run_body(body, "--json") == 0
     out, err = capfd.readouterr()
-    assert out == "{}\n"
-    assert "warning: torn line repaired\n" in err
-    assert "not shown" not in err
+    assert (out, err) == ("{}\n", "warning: torn line repaired\n")
+    assert run_body(body, "--debug") == 0
+    err = capfd.readouterr().err
+    assert "UserWarning: first second" in err
+    assert "debug: not shown\n" in err
     assert (logging.getLogger().handlers, logging.getLogger().level) == (handlers, level)
 
 
