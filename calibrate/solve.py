@@ -38,6 +38,8 @@ _REJECT_CHI2 = 30.7
 """A clean shot exceeds this in one of a million cases (chi-square, three degrees of freedom)."""
 _MEDIAN_CHI2 = 2.366
 _REJECT_ROUNDS = 4
+_TYPICAL_CAP = 16.0
+"""Of the median squared error: four times the typical miss, beyond any clean shot's."""
 _FIRST_NOISE = NoiseModel(point_mm=0.05, pose_mm=0.3, pose_rad=5e-4)
 
 
@@ -218,8 +220,13 @@ def _for_model(state: State, camera_error: CameraError) -> State:
 
 
 def _simplest_of_the_best(tried: Sequence[Solved]) -> int:
-    """The first model whose held-out error is within one standard error (of the difference) of the best."""
+    """The first model whose held-out error is within one standard error (of the difference) of the best.
+
+    Errors are capped at some times the typical one: a lone pose that no solve without it predicts would drown the rest.
+    """
     errors = [squared_errors_mm2(t.held_out) for t in tried]
+    cap = _TYPICAL_CAP * min(float(np.median(error)) for error in errors)
+    errors = [np.minimum(error, cap) for error in errors]
     best = int(np.argmin([error.mean() for error in errors]))
     for i, error in enumerate(errors):
         difference = error - errors[best]
