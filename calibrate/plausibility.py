@@ -35,7 +35,8 @@ def check_reported_poses(sessions: Sequence[Session], model: RobotModel | None) 
         mm, rad = _difference(mdh.base_from_flange(model, joints), reported)
         if mm > FACTORY_MM or rad > FACTORY_RAD:
             raise DataError(
-                f"recorded flange poses and axis angles disagree by {mm:.1f} mm and {np.degrees(rad):.2f} degrees (medians); {likely_cause(model, joints, reported)}",
+                f"recorded flange poses and axis angles disagree by {mm:.1f} mm and {np.degrees(rad):.2f} degrees (medians); "
+                f"{likely_cause(model, joints, reported)}",
                 file=session.folder / "shots.jsonl",
                 remedy="Correct the recording or the robot model; the axis angles decide, the poses are a cross-check.",
             )

@@ -123,7 +123,8 @@ def measured_centres(solved: Solved, observations: Observations) -> dict[str, Fl
         base_from_camera = flange @ state.flange_from_camera
         corrected = shot.points_in_camera_mm + correction_in_camera_mm(problem.camera_error, state.camera_mm, shot.points_in_camera_mm)
         points.setdefault(shot.sphere, []).append(se3.apply(base_from_camera, corrected))
-        starts.setdefault(shot.sphere, []).append(se3.apply(base_from_camera, shot.centre_in_camera_mm))
+        if shot.centre_in_camera_mm is not None:
+            starts.setdefault(shot.sphere, []).append(se3.apply(base_from_camera, shot.centre_in_camera_mm))
     radius = DIAMETER_MM / 2 + state.radius_offset_mm
     return {name: fit_fixed_radius(np.concatenate(p), radius, np.mean(starts[name], axis=0))[0] for name, p in points.items()}
 
