@@ -7,7 +7,7 @@ Each block (xi_1 ... xi_n, xi_EC, k) is moved by one linear least-squares step o
 `exp(xi) <- exp(delta) exp(xi)`, until f no longer falls or L sweeps are done. Kept as it was printed but for two things:
 every block is solved by a rank-revealing least squares (the xi_1 block is singular: its rotation and slide about axis 1
 move all points alike), and k is sought in units of mm at 250 mm (the normal equations of the printed k, 1e-9 to 1e-18,
-lose all digits); the paper's k is what `StepwiseState.k` gives back. METHOD.md 3 lists what is wrong with the method.
+lose all digits); `PillowError.coefficients_k` gives the paper's k back. METHOD.md 3 lists what is wrong with the method.
 """
 
 from __future__ import annotations
@@ -30,11 +30,14 @@ IntArray = NDArray[np.int64]
 
 TWIST_SCALE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 """Unit of each twist component in a block: 1 mm, and 1 mrad, which moves points about as far."""
-RELATIVE_ZERO = 3e-3
+RELATIVE_ZERO = 1e-2
 """Singular values of a scaled block below this share of the largest are taken as zero.
 
-The turn about axis 1 is no exact zero: points that do not coincide yet (millimetres of a metre) lend it about this much.
+The turn about axis 1 is no exact zero: points that do not coincide yet (millimetres of a metre) lend it some thousandths,
+and noise then decides how far it goes. The weakest direction that the shots determine has a tenth.
 """
+CAMERA_RELATIVE_ZERO = 1e-6
+"""The same for the scaled camera terms, which are nearly parallel though none of them is a gauge."""
 LEAST_SHOTS = 4
 
 
@@ -65,6 +68,8 @@ class StepwiseSettings:
     """The pillow of eq. 5 in the paper; None leaves the camera as it is."""
     max_sweeps: int = 1000
     """The paper's L."""
+    relative_zero: float = RELATIVE_ZERO
+    """Of the twist blocks."""
     least_fall: float = 1e-6
     """f counts as fallen when it is smaller by this share: near its end the descent creeps on for ever."""
 
@@ -165,7 +170,7 @@ def corrected_centres(data: StepwiseData, state: StepwiseState, camera_error: Ca
 
 
 def objective_mm2(data: StepwiseData, state: StepwiseState, camera_error: CameraError | None) -> float:
-    """f of eq. 8."""
+    """The sum f of eq. 8."""
     difference = _differences(points_in_base_mm(data, state, camera_error), data.pairs)
     return 0.5 * float((difference**2).sum())
 
@@ -205,7 +210,7 @@ def swept(data: StepwiseData, state: StepwiseState, settings: StepwiseSettings) 
         errors, beyond = state.link_errors.copy(), _points_beyond_links(data, state, centres)
         for i in range(data.n_links):
             frame = before @ data.link_transforms[:, i]
-            delta = _twist_step(frame, se3.apply(errors[i], beyond[i]), data.pairs)
+            delta = _twist_step(frame, se3.apply(errors[i], beyond[i]), data.pairs, settings.relative_zero)
             errors[i] = se3.exp(delta) @ errors[i]
             before = frame @ errors[i]
         state = replace(state, link_errors=errors)
@@ -214,7 +219,7 @@ def swept(data: StepwiseData, state: StepwiseState, settings: StepwiseSettings) 
             before = before @ data.link_transforms[:, i] @ state.link_errors[i]
     frame = before @ state.hand_eye_guess
     if settings.hand_eye:
-        delta = _twist_step(frame, se3.apply(state.hand_eye_error, centres), data.pairs)
+        delta = _twist_step(frame, se3.apply(state.hand_eye_error, centres), data.pairs, settings.relative_zero)
         state = replace(state, hand_eye_error=se3.exp(delta) @ state.hand_eye_error)
     if settings.camera_error is None or not len(state.camera_mm):
         return state
@@ -234,23 +239,22 @@ def camera_block(frame: FloatArray, hand_eye_error: FloatArray, centres_in_camer
     return np.asarray(rotation[:, :, camera_error.axis] * basis[:, None, :])
 
 
-def rank_revealing_step(columns: FloatArray, difference: FloatArray, relative_zero: float = RELATIVE_ZERO) -> FloatArray:
+def rank_revealing_step(columns: FloatArray, difference: FloatArray, relative_zero: float) -> FloatArray:
     """Least-norm delta (k,) that brings differences (p, 3) nearest to zero, columns (p, 3, k): eqs. 11 and 15."""
     flat = columns.reshape(-1, columns.shape[-1])
     return np.asarray(-np.linalg.lstsq(flat, difference.reshape(-1), rcond=relative_zero)[0])
 
 
-def _twist_step(frame: FloatArray, points_in_frame_mm: FloatArray, pairs: IntArray) -> FloatArray:
+def _twist_step(frame: FloatArray, points_in_frame_mm: FloatArray, pairs: IntArray, relative_zero: float) -> FloatArray:
     in_base, columns = twist_block(frame, points_in_frame_mm)
     scaled = _differences(columns, pairs) * TWIST_SCALE
-    return rank_revealing_step(scaled, _differences(in_base, pairs)) * TWIST_SCALE
+    return np.asarray(rank_revealing_step(scaled, _differences(in_base, pairs), relative_zero) * TWIST_SCALE)
 
 
 def _camera_step(data: StepwiseData, state: StepwiseState, frame: FloatArray, corrected: FloatArray, camera_error: CameraError) -> FloatArray:
     in_base = se3.apply(frame @ state.hand_eye_error, corrected)
     columns = camera_block(frame, state.hand_eye_error, data.centres_in_camera_mm, camera_error)
-    # the scaled terms of a pillow are nearly parallel, and yet none of them is a gauge
-    return rank_revealing_step(_differences(columns, data.pairs), _differences(in_base, data.pairs), 1e-6)
+    return rank_revealing_step(_differences(columns, data.pairs), _differences(in_base, data.pairs), CAMERA_RELATIVE_ZERO)
 
 
 def _points_beyond_links(data: StepwiseData, state: StepwiseState, centres: FloatArray) -> list[FloatArray]:

@@ -20,10 +20,10 @@ from drivers.kinematics.se3 import FloatArray
 _DH_SCALE = np.array([1.0, 1e-3, 1.0, 1e-3])
 _TWIST_SCALE = np.array([1.0] * 3 + [1e-3] * 3)
 _LEAST_STEP = 1e-7
-RANK_REVEALING = 1e-4
+RANK_REVEALING = 1e-3
 """Directions that move the differences by less than this share of the strongest one are left alone: gauge."""
-AS_PRINTED = 1e-9
-"""Nearly nothing is left alone, as where normal equations are inverted: noise then decides the gauge."""
+GAUGE_LEFT_TO_NOISE = 1e-6
+"""Next to nothing is left alone, as where normal equations are inverted: noise then decides the gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,8 +58,9 @@ def solve_linearised_dh(
     """
     found, hand_eye = model, hand_eye_guess
     pairs = consecutive_pairs(np.zeros(len(joints_rad), dtype=np.int64))
-    iteration = 0
-    for iteration in range(1, max_iterations + 1):
+    iterations = 0
+    while iterations < max_iterations:
+        iterations += 1
         points, columns = dh_columns(found, joints_rad, hand_eye, centres_in_camera_mm)
         scale = np.concatenate([np.tile(_DH_SCALE, model.n_joints), _TWIST_SCALE])
         flat = _difference(columns, pairs).reshape(-1, columns.shape[-1]) * scale
@@ -68,7 +69,7 @@ def solve_linearised_dh(
         if float(np.abs(flat @ scaled).max()) < _LEAST_STEP:
             break
     points, _ = dh_columns(found, joints_rad, hand_eye, centres_in_camera_mm)
-    return DhResult(found, hand_eye, iteration, 0.5 * float((_difference(points, pairs) ** 2).sum()))
+    return DhResult(found, hand_eye, iterations, 0.5 * float((_difference(points, pairs) ** 2).sum()))
 
 
 def dh_columns(model: RobotModel, joints_rad: FloatArray, hand_eye: FloatArray, centres_in_camera_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,9 +87,7 @@ def moved(model: RobotModel, hand_eye: FloatArray, step: FloatArray) -> tuple[Ro
     """The model and the hand-eye transform after a step (4 n + 6,) of `dh_columns`' unknowns."""
     a, alpha, d, theta = step[: 4 * model.n_joints].reshape(-1, 4).T
     return (
-        replace(
-            model, a_mm=model.a_mm + a, alpha_rad=model.alpha_rad + alpha, d_mm=model.d_mm + d, theta_offset_rad=model.theta_offset_rad + theta
-        ),
+        replace(model, a_mm=model.a_mm + a, alpha_rad=model.alpha_rad + alpha, d_mm=model.d_mm + d, theta_offset_rad=model.theta_offset_rad + theta),
         se3.exp(step[4 * model.n_joints :]) @ hand_eye,
     )
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.inverse import branches_of_many
@@ -27,6 +28,7 @@ TABLE_1_D_MM = (0.0018, 0.0033, 0.0071, 0.0075, 0.0032, 0.0018)
 TABLE_1_THETA_RAD = (3.0e-4, 4.5e-4, -1.5e-4, 3.0e-4, -0.0011, 1.5e-4)
 PAPER_K = (1e-9, 7e-15, 5e-18)
 SIGHT_CROSSING_MM = (60.0, 0.0, 500.0)
+_QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +97,11 @@ class StudyShots:
     clouds_in_camera_mm: FloatArray
     """(m, n, 3) points of the cap that faces the camera, errors and noise on every point; n may be 0."""
 
-    def ordered(self, order: FloatArray) -> StudyShots:
+    def ordered(self, order: NDArray[np.intp]) -> StudyShots:
         """The same shots as if captured in another order (m,)."""
-        i = np.asarray(order, dtype=np.int64)
-        return StudyShots(self.joints_rad[i], self.true_centre_in_camera_mm[i], self.centre_in_camera_mm[i], self.clouds_in_camera_mm[i])
+        return StudyShots(
+            self.joints_rad[order], self.true_centre_in_camera_mm[order], self.centre_in_camera_mm[order], self.clouds_in_camera_mm[order]
+        )
 
 
 def paper_cell() -> StudyCell:
@@ -112,10 +115,14 @@ def paper_cell() -> StudyCell:
         d_mm=nominal.d_mm + TABLE_1_D_MM,
         theta_offset_rad=nominal.theta_offset_rad + TABLE_1_THETA_RAD,
     )
-    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    truth = se3.from_rotation_translation(quarter, [60.0, 60.0, 85.0])
-    guess = se3.from_rotation_translation(quarter @ se3.exp_so3([0.0035, 0.0034, 0.0051]), [59.5445, 61.3253, 86.2298])
-    return StudyCell(nominal, true, truth, guess)
+    truth = se3.from_rotation_translation(_QUARTER_TURN, [60.0, 60.0, 85.0])
+    return with_guess_signs(StudyCell(nominal, true, truth, truth), (1, 1, 1))
+
+
+def with_guess_signs(cell: StudyCell, signs: tuple[int, ...]) -> StudyCell:
+    """The cell with the paper's first guess; its text lost the minus signs, so that those of the rotation are a choice."""
+    rotation = _QUARTER_TURN @ se3.exp_so3(np.array([0.0035, 0.0034, 0.0051]) * signs)
+    return replace(cell, flange_from_camera_guess=se3.from_rotation_translation(rotation, [59.5445, 61.3253, 86.2298]))
 
 
 def draw_shots(cell: StudyCell, rng: np.random.Generator, n_shots: int, *, noise: StudyNoise = NO_NOISE, n_points: int = 0) -> StudyShots:
