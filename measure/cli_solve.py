@@ -103,7 +103,8 @@ def calibrate(
 
         require_writable(out)
         read = [read_session(folder) for folder in sessions]
-        calibration = calibrate_sessions(read, CalibrationSettings(camera_error=camera_error.value))
+        with run.console.progress("calibrating"):
+            calibration = calibrate_sessions(read, CalibrationSettings(camera_error=camera_error.value))
         former = save_calibration(calibration, out)
         if former is not None:
             run.console.note(f"the earlier {out} was kept as {former}")
