@@ -22,6 +22,7 @@ from calibrate.study_accuracy import (
 )
 from calibrate.study_cell import StudyNoise, paper_cell
 from calibrate.study_clouds import clouds_table, diameter_figure, fit_variants, stitching, table_5
+from calibrate.study_compare import comparison
 from calibrate.study_data import StudyFigure, StudyTable
 from calibrate.study_sweeps import camera_sweep, noise_sweep
 
@@ -123,6 +124,8 @@ def _run(settings: StudySettings, progress: Progress) -> Study:
     figures += [diameter_figure("figure5", cell, None, s.n_points), figure_10(first, fitted)]
     figures += [diameter_figure("figure11", cell, clouds[0][1], s.n_points), *sections]
     steps.done()
+    named = {table.name: table for table in tables}
+    tables.insert(0, comparison(named["table3"], named["table5"], named["stitching"]))
     return Study(s, tuple(tables), tuple(figures), time.perf_counter() - began)
 
 

@@ -116,8 +116,13 @@ def diameter_figure(name: str, cell: StudyCell, chains: Chains | None, n_points:
         places = np.tile([0.0, 0.0, 330.0], (13, 1))
         places[:, axis] = np.linspace(*span, 13)
         # the same points on every sphere, so that the curves show the error and not the sample
-        measured = np.stack([cell.measured(caps(p[None], cell.radius_mm, n_points, np.random.default_rng(0)))[0] for p in places])
+        true = np.stack([caps(p[None], cell.radius_mm, n_points, np.random.default_rng(0))[0] for p in places])
+        measured = cell.measured(true)
         curves = [Curve("as measured", places[:, axis], _diameters(measured, places, cell.radius_mm))]
+        if chains is None:
+            # the sign that the paper found on its hardware (Table 4)
+            other = cell.with_camera_error(-1.0).measured(true)
+            curves.append(Curve("k of the other sign", places[:, axis], _diameters(other, places, cell.radius_mm)))
         for variant in (Variant("1", "free"), Variant("clouds", "points")) if chains else ():
             corrected = (chains or {})[variant].corrected(measured)
             curves.append(Curve(f"corrected, {LABELS[variant.method]}", places[:, axis], _diameters(corrected, places, cell.radius_mm)))

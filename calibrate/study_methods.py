@@ -154,6 +154,4 @@ def centres_seen(fitted: Fitted, cell: StudyCell, shots: StudyShots, source: str
 
 
 def _of_state(method: str, cell: StudyCell, state: State, steps: int, seconds: float) -> Fitted:
-    return Fitted(
-        method, cell.nominal, state.link_twists, state.flange_from_camera, PILLOW, state.camera_mm, state.radius_offset_mm, steps, seconds
-    )
+    return Fitted(method, cell.nominal, state.link_twists, state.flange_from_camera, PILLOW, state.camera_mm, state.radius_offset_mm, steps, seconds)

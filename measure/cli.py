@@ -15,11 +15,13 @@ import typer
 from measure.cli_capture import capture
 from measure.cli_cell import doctor, new_cell
 from measure.cli_demo import demo
+from measure.cli_export import export
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
 from measure.cli_report import report, show
 from measure.cli_run import run_app
 from measure.cli_solve import calibrate, centres
+from measure.cli_study import study
 from measure.console import Console
 
 app = typer.Typer(
@@ -44,6 +46,8 @@ app.command("verify")(verify)
 app.command("stitch")(stitch)
 app.command("report")(report)
 app.command("show")(show)
+app.command("study")(study)
+app.command("export")(export)
 
 
 @app.callback(invoke_without_command=True)
