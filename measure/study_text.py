@@ -43,8 +43,8 @@ SECTIONS = (
         "place, on noise-free tests. Rms about the mean is what a calibration is good for; lengths are between places that no training sphere "
         "stood at.",
         agree="Order and size of the spread: method 1 far below method 2, method 2 far below method 3.",
-        differ="e_mean and e_max are mostly a shift of the whole base frame, which differences of positions cannot see. So method 2 can have a larger "
-        "e_mean than no calibration at all, as in the paper, with a small part of its spread. Method 4 does not fail: with its gauge left to "
+        differ="e_mean and e_max are mostly a shift of the whole base frame, which differences of positions cannot see. So method 2 can have a "
+        "larger e_mean than no calibration at all, as in the paper, with a small part of its spread. Method 4 does not fail: with its gauge left to "
         "noise it lands elsewhere, up to tens of millimetres away, with the spread unchanged, and that is what 134.8 mm with a std of 0.66 "
         "looks like.",
         tables=("table3",),
@@ -88,8 +88,8 @@ SECTIONS = (
         "The solver itself",
         "Algorithm 1 moves one block after the other; all blocks at once (Gauss-Newton on the same centres) need a handful of steps. "
         "Consecutive differences make the result depend on the order of the shots, which it must not.",
-        differ="Found here, not in the paper: taken in another order the same shots give another stepwise calibration, the move being as large as its "
-        "error; the joint solve moves by rounding.",
+        differ="Found here, not in the paper: taken in another order the same shots give another stepwise calibration, the move being as large as "
+        "its error; the joint solve moves by rounding.",
         tables=("order",),
         figures=("descent",),
     ),
@@ -97,16 +97,16 @@ SECTIONS = (
         "Figs 5 and 11: fitted diameter over the camera's volume",
         "A sphere of 38.1 mm fitted with a free radius, before and after the correction that each calibration found.",
         agree="A depth error bends the sphere, most where the camera is near; corrected points read close to the certified diameter.",
-        differ="The paper's camera always reads large, by up to 0.4 mm, less so far away. With the simulated k a sphere reads small; with the other sign, "
-        "which is that of the k found on hardware (Table 4), it reads large and falls with z, as in the paper's Fig 5. Method 1 fits k to centres "
+        differ="The paper's camera always reads large, by up to 0.4 mm, less so far away. With the simulated k a sphere reads small; with the other "
+        "sign, which is that of the k found on hardware (Table 4), it reads large and falls with z, as in the paper's Fig 5. Method 1 fits k to centres "
         "of free-radius fits, which move with the bend, and overshoots: the paper too finds its deviation not completely eliminated.",
         figures=("figure5", "figure11"),
     ),
     Section(
         "Fig 10: size of each compensation",
         "How far robot, hand-eye and camera are moved at each noisy test.",
-        differ="How a displacement is split between robot and hand-eye is decided by the gauge and by the order of the blocks; the paper itself calls "
-        "the values a reference only.",
+        differ="How a displacement is split between robot and hand-eye is decided by the gauge and by the order of the blocks; the paper itself "
+        "calls the values a reference only.",
         figures=("figure10",),
     ),
     Section(
