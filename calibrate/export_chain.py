@@ -4,6 +4,9 @@
 
 with C the coupling of the model. It is `prod_i T_i(theta_i) exp(xi_i)` with RotZ(theta_i) = RotZ(offset_i) RotZ(C_i q) taken apart; RotZ
 and TransZ of one axis commute. The datum of the base is in origins[0], the last link's twist in origins[n].
+
+A robot that also yields under gravity is no such chain: the part of it that is constant over the seen axis ranges goes into the
+offsets of the axes, and the rest is the stated residual.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibrate.export_notes import robot_of, seen_joints_rad
-from drivers.errors import DataError
+from calibrate.export_residual import Residual, corners, point_rows, residual_of
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -22,9 +25,9 @@ from drivers.kinematics.se3 import FloatArray
 if TYPE_CHECKING:
     from calibrate.result import Calibration
 
-_EXACT_MM = 1e-7
-_EXACT_RAD = 1e-10
-_N_CHECKED = 20
+EXACT_MM = 1e-7
+_STEPS = 4
+_N_FIT = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,43 +37,57 @@ class RigidChain:
     model: RobotModel
     origins: FloatArray
     """(n + 1, 4, 4): base to axis 1, axis i to axis i + 1, axis n to flange; mm."""
+    residual: Residual
+    """What the calibrated robot does that no constant transforms do; rounding for a robot without further terms."""
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing but rounding is left."""
+        return self.residual.arm_max_mm < EXACT_MM
+
+    def text(self) -> str:
+        """One line on how exact it is."""
+        return "exact: holds the corrected robot without loss" if self.exact else f"not exact, the robot yields under load; {self.residual.text()}"
 
 
 def rigid_chain(calibration: Calibration, what: str) -> RigidChain:
-    """The chain of a calibration, compared with its forward kinematics.
+    """The chain of a calibration and what it leaves, found by comparing it with the calibration's forward kinematics.
 
     Raises:
         SettingsError: the calibration is pose-only.
-        DataError: the calibrated robot bends or stretches, which no constant transforms can say.
     """
     model = robot_of(calibration, what)
     still = replace(model, coupling=np.zeros_like(model.coupling))
-    steps = mdh.link_transforms(still, np.zeros(model.n_joints))
-    twists = se3.exp(calibration.link_twists)
-    origins = np.concatenate([steps, np.eye(4)[None]])
+    origins = np.concatenate([mdh.link_transforms(still, np.zeros(model.n_joints)), np.eye(4)[None]])
+    origins[1:] = se3.exp(calibration.link_twists) @ origins[1:]
     origins[0] = calibration.datum.base_from_solver @ origins[0]
-    origins[1:] = twists @ origins[1:]
-    chain = RigidChain(model, origins)
-    _check_exact(calibration, chain, what)
-    return chain
+    residual = residual_of(calibration, lambda joints: _frames(model, origins, joints)[-1])
+    if residual.arm_max_mm >= EXACT_MM:
+        origins = _with_constant_offsets(calibration, model, origins)
+        residual = residual_of(calibration, lambda joints: _frames(model, origins, joints)[-1])
+    return RigidChain(model, origins, residual)
 
 
-def chain_flange(chain: RigidChain, joints_rad: FloatArray) -> FloatArray:
-    """Forward kinematics (k, 4, 4) of a chain for axis angles (k, n)."""
-    turns = joints_rad @ chain.model.coupling.T
-    flange = np.broadcast_to(chain.origins[0], (len(joints_rad), 4, 4))
-    for i, origin in enumerate(chain.origins[1:]):
+def _frames(model: RobotModel, origins: FloatArray, joints_rad: FloatArray) -> list[FloatArray]:
+    """Frames (k, 4, 4) at every axis before it turns, and the flange, for axis angles (k, n)."""
+    turns = joints_rad @ model.coupling.T
+    frames = [np.broadcast_to(origins[0], (len(joints_rad), 4, 4))]
+    for i, origin in enumerate(origins[1:]):
         rotation = se3.exp_so3(turns[:, i, None] * np.array([0.0, 0.0, 1.0]))
-        flange = flange @ se3.from_rotation_translation(rotation, np.zeros(3)) @ origin
-    return np.asarray(flange)
+        frames.append(frames[-1] @ se3.from_rotation_translation(rotation, np.zeros(3)) @ origin)
+    return frames
 
 
-def _check_exact(calibration: Calibration, chain: RigidChain, what: str) -> None:
-    joints = seen_joints_rad(calibration, _N_CHECKED)
-    miss = se3.log(se3.inverse(chain_flange(chain, joints)) @ calibration.base_from_flange(joints))
-    off_mm, off_rad = np.abs(miss[:, :3]).max(), np.abs(miss[:, 3:]).max()
-    if off_mm > _EXACT_MM or off_rad > _EXACT_RAD:
-        raise DataError(
-            f"{what} holds constant transforms only; the corrected robot differs from them by up to {off_mm:.4f} mm, {off_rad:.2g} rad",
-            remedy="Export corrected targets (targets-csv, targets-rapid), which follow the whole calibration.",
-        )
+def _with_constant_offsets(calibration: Calibration, model: RobotModel, origins: FloatArray) -> FloatArray:
+    """Origins with a constant offset of every axis that brings the chain nearest to the calibrated robot (Gauss-Newton)."""
+    joints = seen_joints_rad(calibration, _N_FIT)
+    target = corners(calibration.base_from_flange(joints))
+    result = origins.copy()
+    for _ in range(_STEPS):
+        frames = _frames(model, result, joints)
+        points = corners(frames[-1])
+        axes = np.stack([se3.adjoint(frame)[:, :, 5] for frame in frames[:-1]], axis=1)
+        offsets = np.linalg.lstsq(point_rows(axes, points), (target - points).reshape(-1), rcond=None)[0]
+        rotation = se3.exp_so3(offsets[:, None] * np.array([0.0, 0.0, 1.0]))
+        result[:-1] = result[:-1] @ se3.from_rotation_translation(rotation, np.zeros(3))
+    return result

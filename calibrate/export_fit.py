@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibrate.datum import ARM_MM
 from calibrate.export_notes import robot_of, seen_joints_rad
+from calibrate.export_residual import Residual, corners, point_rows, residual_of
 from drivers.errors import DataError
-from drivers.kinematics import mdh, se3
+from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NEARLY_PARALLEL_RAD = np.radians(2.0)
 _DIRECTIONS = {"tx": 0, "ty": 1, "tz": 2, "rx": 3, "ry": 4, "rz": 5}
 _STEPS = 60
-_N_FIT, _N_JUDGE = 200, 2000
+_N_FIT = 200
 _CONVERGED_MM = 1e-10
 # One unit of a parameter: a millimetre, and the angle that moves the end of a long arm by about as much.
 _UNIT_MM, _UNIT_RAD = 1.0, 1e-3
@@ -44,25 +44,6 @@ class Motion:
     axis: int | None = None
     """The axis whose MDH turn `coupling[axis] @ q` is added."""
     fixed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Residual:
-    """What a table cannot say, over poses in the seen axis ranges that it was not fitted to."""
-
-    origin_rms_mm: float
-    origin_max_mm: float
-    arm_rms_mm: float
-    """Of points 400 mm from the flange, where work is measured."""
-    arm_max_mm: float
-    n_poses: int
-
-    def text(self) -> str:
-        """One line."""
-        return (
-            f"what this table cannot express, against the corrected robot at {self.n_poses} poses in the seen axis ranges: flange origin rms "
-            f"{self.origin_rms_mm:.3e} mm, max {self.origin_max_mm:.3e} mm; {ARM_MM:.0f} mm from it rms {self.arm_rms_mm:.3e} mm, max {self.arm_max_mm:.3e} mm"
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,7 +84,8 @@ def fit_table(calibration: Calibration, motions: tuple[Motion, ...], *, ridge: f
     Args:
         calibration: with a robot and seen axis ranges.
         motions: the table, with nominal values to start from.
-        ridge: mm of residual that one unit (1 mm, 1 mrad) of a parameter's change is held to be worth: keeps those that the poses do not tell apart small.
+        ridge: mm of residual that one unit (1 mm, 1 mrad) of a parameter's change is held to be worth: keeps those small that
+            the poses do not tell apart.
 
     Raises:
         SettingsError: the calibration is pose-only.
@@ -111,22 +93,22 @@ def fit_table(calibration: Calibration, motions: tuple[Motion, ...], *, ridge: f
     """
     model = robot_of(calibration, "a table of Denavit-Hartenberg parameters")
     joints = seen_joints_rad(calibration, _N_FIT)
-    target = _corners(calibration.base_from_flange(joints))
+    target = corners(calibration.base_from_flange(joints))
     free = [i for i, motion in enumerate(motions) if not motion.fixed]
     unit = np.array([_UNIT_MM if motions[i].direction[0] == "t" else _UNIT_RAD for i in free])
     nominal = np.array([motion.nominal for motion in motions])
     values = nominal.copy()
     for _ in range(_STEPS):
         flange, jacobian = _table_chain(model, motions, values, joints)
-        points = _corners(flange)
-        design = _point_rows(jacobian[:, free], points) * unit
+        points = corners(flange)
+        design = point_rows(jacobian[:, free], points) * unit
         step = _ridge_step(design, (target - points).reshape(-1), (nominal - values)[free] / unit, ridge)
         values[free] += unit * step
         if np.abs(design @ step).max() < _CONVERGED_MM:
             return FittedTable(
                 dict(zip((m.name for m in motions), values.tolist(), strict=True)),
                 {motion.name: motion.nominal for motion in motions},
-                _residual(calibration, model, motions, values),
+                residual_of(calibration, lambda poses: _table_chain(model, motions, values, poses)[0]),
             )
     raise DataError("no Denavit-Hartenberg parameters were found near the nominal ones", remedy="Export URDF, which holds every robot exactly.")
 
@@ -147,30 +129,7 @@ def _table_chain(model: RobotModel, motions: tuple[Motion, ...], values: FloatAr
     return frame, np.stack(columns, axis=1)
 
 
-def _point_rows(jacobian: FloatArray, points_mm: FloatArray) -> FloatArray:
-    """(k 4 3, p): motion of points (k, 4, 3) by left twists (k, p, 6)."""
-    moved = jacobian[:, None, :, :3] + np.cross(jacobian[:, None, :, 3:], points_mm[:, :, None, :])
-    return np.asarray(np.swapaxes(moved, 2, 3).reshape(-1, jacobian.shape[1]))
-
-
 def _ridge_step(design: FloatArray, residual: FloatArray, to_nominal: FloatArray, ridge: float) -> FloatArray:
     weight = ridge * np.sqrt(len(design) / 3)
     stacked = np.concatenate([design, weight * np.eye(design.shape[1])])
     return np.asarray(np.linalg.lstsq(stacked, np.concatenate([residual, weight * to_nominal]), rcond=None)[0])
-
-
-def _residual(calibration: Calibration, model: RobotModel, motions: tuple[Motion, ...], values: FloatArray) -> Residual:
-    joints = seen_joints_rad(calibration, _N_JUDGE)
-    flange, _ = _table_chain(model, motions, values, joints)
-    off = np.linalg.norm(_corners(flange) - _corners(calibration.base_from_flange(joints)), axis=-1)
-    origin, arm = off[:, 0], off[:, 1:]
-    return Residual(*(float(v) for v in (_rms(origin), origin.max(), _rms(arm), arm.max())), n_poses=len(joints))
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
-def _corners(base_from_flange: FloatArray) -> FloatArray:
-    """(k, 4, 3) the flange origin and three points at the distance of the work."""
-    return se3.apply(base_from_flange[:, None], np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)]))

@@ -105,7 +105,7 @@ def urdf_camera_joint(calibration: Calibration, parent: str = "flange", child: s
     """URDF: the two links and the fixed joint between them, to be copied into a robot description."""
     robot = ET.Element("robot", name="spherecal_hand_eye")
     for line in (*provenance(calibration, unit="m, rad", frame=FRAME), nominal_robot_note(calibration)):
-        robot.append(xml_comment(line))
+        add_comment(robot, line)
     ET.SubElement(robot, "link", name=parent)
     add_fixed_joint(robot, calibration.flange_from_camera, parent, child)
     return xml_text(robot)
@@ -126,11 +126,11 @@ def add_origin(joint: ET.Element, parent_from_child: FloatArray) -> None:
     ET.SubElement(joint, "origin", xyz=numbers(xyz, " "), rpy=numbers(rpy, " "))
 
 
-def xml_comment(line: str) -> ET.Element[object]:
-    """A comment; XML allows no two hyphens in a row inside one."""
+def add_comment(robot: ET.Element, line: str) -> None:
+    """Append a comment; XML allows no two hyphens in a row inside one."""
     while "--" in line:
         line = line.replace("--", "- -")
-    return ET.Comment(f" {line} ")
+    robot.append(ET.Comment(f" {line} "))
 
 
 def xml_text(root: ET.Element) -> str:
@@ -141,5 +141,3 @@ def xml_text(root: ET.Element) -> str:
 
 def _head(calibration: Calibration, unit: str) -> str:
     return commented((*provenance(calibration, unit=unit, frame=FRAME), nominal_robot_note(calibration)))
-
-

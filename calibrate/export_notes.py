@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from calibrate.result import Calibration
 
 MM_PER_M = 1000.0
-_SAMPLE_SEED = 20230907
 _MOST_CORNERS = 1024
 
 
@@ -81,8 +80,8 @@ def robot_of(calibration: Calibration, what: str) -> RobotModel:
     return calibration.model
 
 
-def seen_joints_rad(calibration: Calibration, n: int) -> FloatArray:
-    """(k, n_axes) axis angles spread over the seen axis ranges: up to n at random, always the same, and the corners.
+def seen_joints_rad(calibration: Calibration, n: int, *, seed: int = 0) -> FloatArray:
+    """(k, n_axes) axis angles spread over the seen axis ranges: up to n at random, the same for the same seed, and the corners.
 
     Poses beyond linear limits (a parallelogram) are left out.
 
@@ -93,7 +92,7 @@ def seen_joints_rad(calibration: Calibration, n: int) -> FloatArray:
     if seen is None:
         raise SettingsError("the calibration does not say which axis angles it saw", remedy="Calibrate again with sessions that hold joints_rad.")
     lower, upper = seen
-    drawn = np.random.default_rng(_SAMPLE_SEED).uniform(lower, upper, (n, model.n_joints))
+    drawn = np.random.default_rng(seed).uniform(lower, upper, (n, model.n_joints))
     n_corners = min(2**model.n_joints, _MOST_CORNERS)
     bits = (np.arange(n_corners)[:, None] >> np.arange(model.n_joints)) & 1
     joints = np.concatenate([drawn, np.where(bits == 1, upper, lower)])

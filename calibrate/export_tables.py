@@ -10,6 +10,7 @@ import numpy as np
 from calibrate.export_chain import rigid_chain
 from calibrate.export_fit import FittedTable, fit_table, mdh_motions, standard_dh_motions
 from calibrate.export_notes import MM_PER_M, commented, number, numbers, provenance, robot_of, roll_pitch_yaw_rad
+from calibrate.export_residual import Residual
 from drivers.errors import SettingsError
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics.mdh import RobotModel
@@ -51,15 +52,15 @@ def mdh_full_csv(calibration: Calibration) -> tuple[str, FittedTable]:
     return _mdh_text(calibration, model, table, ends), table
 
 
-def ur_kinematics_yaml(calibration: Calibration) -> tuple[str, FittedTable]:
-    """`kinematics_params` of the Universal Robots ROS driver, and standard DH changes in the order of its KinematicsInfo.
+def ur_kinematics_yaml(calibration: Calibration) -> tuple[str, Residual]:
+    """`kinematics_params` of the Universal Robots ROS driver with what they leave, and standard DH changes in the order of its KinematicsInfo.
 
     The driver's description has no place behind the last axis: `wrist_3` (its flange and tool0) is the corrected flange without
     the last link's constant twist, which is given beside it, with the hand-eye that belongs to the file.
 
     Raises:
         SettingsError: the calibration is pose-only, or its robot is no UR.
-        DataError: the calibrated robot is no chain of constant transforms.
+        DataError: no standard DH parameters were found.
     """
     model = robot_of(calibration, "UR kinematics parameters")
     _check_ur(model)
@@ -82,10 +83,11 @@ def ur_kinematics_yaml(calibration: Calibration) -> tuple[str, FittedTable]:
     frame = "each link in the one before it; the first in the controller's base (`base_link_inertia` of ur_description)"
     notes = (
         *provenance(calibration, unit="m, rad; RotZ(yaw) RotY(pitch) RotX(roll) as URDF reads them", frame=frame),
-        "`kinematics` is exact. Behind the last axis the driver has no place: tool0 lacks the constant tool0_from_flange,",
+        f"`kinematics`: {chain.text()}",
+        "behind the last axis the driver has no place: tool0 lacks the constant tool0_from_flange,",
         "so use tool0_from_camera as the hand-eye together with this file. The hash is not the robot's own: the driver says so at its start.",
     )
-    return commented(notes) + dump_yaml(data), table
+    return commented(notes) + dump_yaml(data), chain.residual
 
 
 def _mdh_text(calibration: Calibration, model: RobotModel, table: FittedTable, ends: tuple[str, ...]) -> str:

@@ -1,4 +1,4 @@
-"""URDF of the corrected robot: one revolute joint an axis, every origin a general transform, so nothing is lost.
+"""URDF of the corrected robot: one revolute joint an axis, every origin a general transform, so no link twist is lost.
 
 Coupled axes. Where a controller reports an angle that is not the angle between two links (the upper arm of a parallelogram robot,
 theta_3 = q_3 - q_2), a second joint about the same axis stands before the joint's own and mimics the other axis with the factor of
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibrate.export_chain import RigidChain, rigid_chain
-from calibrate.export_hand_eye import add_fixed_joint, add_origin, xml_comment, xml_text
+from calibrate.export_hand_eye import add_comment, add_fixed_joint, add_origin, xml_text
 from calibrate.export_notes import number, numbers, one_line, provenance
+from calibrate.export_residual import Residual
 from drivers.kinematics.mdh import RobotModel
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 BASE, FLANGE, CAMERA = "base", "flange", "camera"
 
 
-def urdf_robot(calibration: Calibration, joint_names: Sequence[str] | None = None) -> str:
-    """URDF text of the corrected robot with its camera; joints take the controller's axis angles in rad.
+def urdf_robot(calibration: Calibration, joint_names: Sequence[str] | None = None) -> tuple[str, Residual]:
+    """URDF text of the corrected robot with its camera, and what it leaves; joints take the controller's axis angles in rad.
 
     Args:
         calibration: with a robot.
@@ -35,21 +36,20 @@ def urdf_robot(calibration: Calibration, joint_names: Sequence[str] | None = Non
 
     Raises:
         SettingsError: the calibration is pose-only.
-        DataError: the calibrated robot is no chain of constant transforms.
     """
     chain = rigid_chain(calibration, "URDF")
     names = tuple(joint_names or (f"joint_{i + 1}" for i in range(chain.model.n_joints)))
     robot = ET.Element("robot", name=one_line(chain.model.name))
     frame = "links from `base` to `flange`, joints as the controller reports them; `camera` hangs on the flange"
-    for line in (*provenance(calibration, unit="m, rad", frame=frame), *_remarks(chain.model, names)):
-        robot.append(xml_comment(line))
+    for line in (*provenance(calibration, unit="m, rad", frame=frame), chain.text(), *_remarks(chain.model, names)):
+        add_comment(robot, line)
     ET.SubElement(robot, "link", name=BASE)
     parent = BASE
     for i in range(chain.model.n_joints):
         parent = _add_axis(robot, chain, i, parent, names)
     add_fixed_joint(robot, chain.origins[-1], parent, FLANGE)
     add_fixed_joint(robot, calibration.flange_from_camera, FLANGE, CAMERA)
-    return xml_text(robot)
+    return xml_text(robot), chain.residual
 
 
 def _add_axis(robot: ET.Element, chain: RigidChain, i: int, parent: str, names: Sequence[str]) -> str:
