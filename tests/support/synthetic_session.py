@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.files.ply import encode_ply
-from drivers.files.yaml import dump_yaml
+from drivers.files.yaml import dump_yaml, parse_yaml
 from drivers.kinematics.se3 import FloatArray
 from tests.support.synthetic import SyntheticCell, SyntheticShot
 
@@ -63,3 +63,15 @@ def cell_data(
         "lengths": [{"between": [a, b], "length_mm": length, "expanded_uncertainty_mm": u} for a, b, length, u in lengths],
     }
     return data | dict(extra or {})
+
+
+def pose_only(folder: Path, base_from_flange: Sequence[FloatArray]) -> Path:
+    """Take the axis angles out of a session, and the robot's model out of its cell; poses (4, 4) come instead."""
+    lines = [json.loads(line) for line in (folder / "shots.jsonl").read_text().splitlines()]
+    told = [line | {"joints_rad": None, "base_from_flange": pose.tolist()} for line, pose in zip(lines, base_from_flange, strict=True)]
+    (folder / "shots.jsonl").write_text("\n".join(json.dumps(line) for line in told) + "\n")
+    data = parse_yaml((folder / "cell.yaml").read_text(), file=folder / "cell.yaml")
+    if isinstance(data, dict):
+        data["robot"]["model"] = None
+    (folder / "cell.yaml").write_text(dump_yaml(data))
+    return folder

@@ -1,0 +1,107 @@
+"""The stated base: the best fit of the calibrated to the nominal robot, whatever base the solver ended in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrate.datum import ARM_MM, controller_datum, datum_jacobian, nominal_robot_datum
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
+from tests.support.synthetic import abb_robot, paper_robot
+
+robots = pytest.mark.parametrize("model", [paper_robot(), abb_robot()], ids=lambda m: m.name)
+
+
+def twists(seed: int, size: float = 1.0) -> FloatArray:
+    return np.asarray(size * np.random.default_rng(seed).normal(size=(6, 6)) * [1, 1, 1, 2e-3, 2e-3, 2e-3])
+
+
+def joints(seed: int, n: int = 25) -> FloatArray:
+    return np.asarray(np.random.default_rng(seed).uniform(-1.2, 1.2, (n, 6)))
+
+
+def carried(model: RobotModel, q: FloatArray, link_twists: FloatArray | None = None) -> FloatArray:
+    """(4 k, 3) flange origin and points at arm's length along its axes, at every pose."""
+    corners = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
+    return se3.apply(mdh.base_from_flange(model, q, link_twists)[:, None], corners).reshape(-1, 3)
+
+
+@robots
+def test_a_perfect_robot_is_its_own_datum(model: RobotModel) -> None:
+    np.testing.assert_allclose(nominal_robot_datum(model, np.zeros((6, 6)), joints(0)).base_from_solver, np.eye(4), atol=1e-9)
+
+
+@robots
+@pytest.mark.parametrize("seed", range(3))
+def test_the_datum_is_a_minimum(model: RobotModel, seed: int) -> None:
+    datum = nominal_robot_datum(model, twists(seed), joints(seed))
+    q = datum.reference_joints_rad
+    solved, nominal = carried(model, q, twists(seed)), carried(model, q)
+
+    def misfit(base_from_solver: FloatArray) -> float:
+        return float(((se3.apply(base_from_solver, solved) - nominal) ** 2).sum())
+
+    best = misfit(datum.base_from_solver)
+    assert se3.is_rigid(datum.base_from_solver)
+    for step in np.concatenate([0.1 * np.eye(6)[:3], 1e-4 * np.eye(6)[3:]]):
+        for sign in (1.0, -1.0):
+            assert misfit(se3.exp(sign * step) @ datum.base_from_solver) > best
+
+
+@robots
+@given(st.floats(-50, 50), st.floats(-0.5, 0.5))
+def test_a_shift_of_the_solvers_base_changes_no_stated_pose(model: RobotModel, slide_mm: float, turn_rad: float) -> None:
+    """A slide along and a turn about axis 1 is what link 1 can do to the whole base without any shot noticing."""
+    xi, q = twists(4), joints(4)
+    shifted = xi.copy()
+    shifted[0] = se3.log(se3.exp([0, 0, slide_mm, 0, 0, turn_rad]) @ se3.exp(xi[0]))
+    first, second = nominal_robot_datum(model, xi, q), nominal_robot_datum(model, shifted, q)
+    elsewhere = joints(5)
+    stated = first.base_from_solver @ mdh.base_from_flange(model, elsewhere, xi)
+    np.testing.assert_allclose(second.base_from_solver @ mdh.base_from_flange(model, elsewhere, shifted), stated, atol=1e-8)
+
+
+@robots
+@pytest.mark.parametrize("n", [5, 60, 171])
+def test_the_order_of_the_poses_changes_nothing(model: RobotModel, n: int) -> None:
+    q = joints(6, n)
+    first = nominal_robot_datum(model, twists(6), q)
+    second = nominal_robot_datum(model, twists(6), np.random.default_rng(7).permutation(q))
+    np.testing.assert_array_equal(first.base_from_solver, second.base_from_solver)
+    np.testing.assert_array_equal(first.reference_joints_rad, second.reference_joints_rad)
+    assert len(first.reference_joints_rad) <= n
+
+
+@robots
+def test_the_references_of_a_datum_give_it_again(model: RobotModel) -> None:
+    datum = nominal_robot_datum(model, twists(8), joints(8, 150))
+    again = nominal_robot_datum(model, twists(8), datum.reference_joints_rad)
+    np.testing.assert_array_equal(again.base_from_solver, datum.base_from_solver)
+
+
+@robots
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_datum_jacobian_is_the_derivative(model: RobotModel, size: float) -> None:
+    xi, q = twists(9, size), joints(9)
+    datum = nominal_robot_datum(model, xi, q)
+    jacobian = datum_jacobian(datum, model, xi)
+    for p in range(36):
+        h = 1e-2 if p % 6 < 3 else 1e-5
+        step = h * np.eye(36)[p].reshape(6, 6)
+        forward, back = (nominal_robot_datum(model, xi + s * step, q).base_from_solver for s in (1, -1))
+        # the stated base moves by the left twist of the solver's base that comes before it
+        moved = se3.log(se3.inverse(datum.base_from_solver) @ forward) - se3.log(se3.inverse(datum.base_from_solver) @ back)
+        # first order in the misfit of the fit itself: some tenths of a mm on a metre
+        np.testing.assert_allclose(moved[:3] / (2 * h), jacobian[:3, p], atol=(1e-5 if size == 0 else 5e-3) * (1 if p % 6 < 3 else 1000))
+        np.testing.assert_allclose(moved[3:] / (2 * h), jacobian[3:, p], atol=(1e-8 if size == 0 else 5e-6) * (1 if p % 6 < 3 else 1000))
+    assert np.abs(jacobian).max() > 0.1
+
+
+def test_a_controllers_base_is_taken_as_it_is() -> None:
+    datum = controller_datum()
+    np.testing.assert_array_equal(datum.base_from_solver, np.eye(4))
+    np.testing.assert_array_equal(datum_jacobian(datum, None, np.zeros((0, 6))), np.zeros((6, 0)))
