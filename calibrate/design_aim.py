@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calibrate.design_shots import Scene, ideal_caps, point_weight, pose_covariance_mm2
+from calibrate.design_shots import Scene, ideal_caps, layout_of, point_weight, pose_covariance_mm2
 from drivers.errors import DataError
 from drivers.kinematics.se3 import FloatArray
 
@@ -28,7 +28,7 @@ class Aim:
     lengths: FloatArray
     """(l, P + q) of each length."""
     centres: FloatArray
-    """(c, P + q) of every component of every view's own centre, less its place's mean; empty for line profiles."""
+    """(c, P + q) of every component of every view's own centre about its place's mean; empty for line profiles."""
     centre_noise_mm2: float
     """Mean square distance of one view's centre from the mean that points and pose noise cause by themselves."""
 
@@ -65,7 +65,7 @@ class _Look:
     centre: FloatArray
     """(3, P + q) of the common fit."""
     views: FloatArray
-    """(v, 3, P + q) of every view's own fit, less their mean."""
+    """(v, 3, P + q) of every view's own fit, about their mean."""
     noise_mm2: FloatArray
     """(v,)."""
 
@@ -84,14 +84,14 @@ def _look(scene: Scene, place: FloatArray, views_rad: FloatArray) -> _Look:
     own = np.linalg.solve(normal, right)
     points = np.linalg.inv(normal) / point_weight(scene)
     shot = np.trace(points, axis1=1, axis2=2) + np.trace(pose_covariance_mm2(one, caps.geometry), axis1=1, axis2=2)
-    spread = 1 - 1 / len(views_rad)
-    return _Look(centre, own - own.mean(axis=0), spread * shot)
+    # about the mean of many views, which these few only estimate
+    unbiased = np.sqrt(len(views_rad) / max(len(views_rad) - 1, 1))
+    return _Look(centre, unbiased * (own - own.mean(axis=0)), shot)
 
 
 def _as_unknowns_of(scene: Scene, one: Scene, moved: FloatArray) -> FloatArray:
     """Columns of the one-sphere scene as those of the whole: a measured sphere is none of the calibration's."""
-    empty, none = np.zeros((0, scene.model.n_joints)), np.zeros(0, dtype=np.int64)
-    whole, single = scene.problem(empty, none).layout, one.problem(empty, none).layout
+    whole, single = layout_of(scene), layout_of(one)
     shared = single.sphere_radius.start
     spheres = np.zeros((*moved.shape[:-1], whole.size - shared))
     return np.concatenate([moved[..., :shared], spheres, moved[..., single.size :]], axis=-1)

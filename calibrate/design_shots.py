@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.camera_error import CameraError, PolynomialError
-from calibrate.design_mismatch import CameraDisturbance, Mismatch, camera_disturbance, droop_columns
+from calibrate.camera_error import CameraError
+from calibrate.design_mismatch import CameraDisturbance, Mismatch, camera_disturbance, deflection_columns
 from calibrate.normal import NoiseModel
-from calibrate.problem import Geometry, LengthConstraint, Priors, Problem, State, linearise_geometry
-from drivers.kinematics import mdh, se3
+from calibrate.problem import Geometry, Layout, LengthConstraint, Priors, Problem, State, linearise_geometry
+from calibrate.robot_terms import compliance_terms
+from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
@@ -62,8 +63,8 @@ class Scene:
     """(S,)."""
     lengths: tuple[LengthConstraint, ...]
     camera_error: CameraError
-    camera_box: PolynomialError
-    """The box of the camera frame that the disturbances are laid over; nothing else of it is used."""
+    camera_box_mm: FloatArray
+    """(2, 3) the part of the camera frame in which it sees."""
     expectation: Expectation = field(default_factory=Expectation)
     along_sight: bool = True
     """False for line profiles."""
@@ -71,7 +72,7 @@ class Scene:
     @property
     def disturbance(self) -> CameraDisturbance:
         """What the camera may do unmodelled."""
-        return camera_disturbance(self.expectation.mismatch, self.camera_box, self.camera_error)
+        return camera_disturbance(self.expectation.mismatch, self.camera_box_mm, self.camera_error)
 
     def problem(self, joints_rad: FloatArray, sphere: IntArray) -> Problem:
         """The problem (without points) of shots with joints (m, n) at spheres (m,), one scan each."""
@@ -98,6 +99,7 @@ class Scene:
             link_twists=np.zeros((self.model.n_joints, 6)),
             flange_from_camera=self.flange_from_camera,
             camera_mm=np.zeros(len(self.camera_error.axis)),
+            terms_rad=np.zeros(0),
             radius_offset_mm=0.0,
             sphere_radius_deviation_mm=np.zeros(len(self.radius_mm)),
             centres_in_base_mm=self.centres_in_base_mm,
@@ -114,15 +116,15 @@ class Caps:
     """(m, t, 3) normals in the camera."""
     shares: FloatArray
     """(m, t, v + c): residual per row of `Geometry.columns`, then per disturbance of the camera."""
-    droop: FloatArray
-    """(m, 3, n) motion of the sphere's centre in the camera per disturbance of the robot."""
+    deflection: FloatArray
+    """(m, 3, K) motion of the sphere's centre in the camera per disturbance of the robot."""
 
     @property
     def moved(self) -> FloatArray:
         """(m, t, P + q) residual of every point per unknown and per disturbance (robot's first, then the camera's)."""
         v = self.geometry.columns.shape[1]
         unknowns = self.shares[..., :v] @ self.geometry.columns
-        return np.concatenate([unknowns, self.unit @ self.droop, self.shares[..., v:]], axis=-1)
+        return np.concatenate([unknowns, self.unit @ self.deflection, self.shares[..., v:]], axis=-1)
 
 
 def ideal_caps(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> Caps:
@@ -137,9 +139,9 @@ def ideal_caps(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> Caps:
     offset = -np.ones((*unit.shape[:2], 1))
     shares = [unit, basis * unit[..., axis], offset, scene.disturbance.shares(points, unit)]
     in_base = scene.centres_in_base_mm[sphere]
-    droop = droop_columns(scene.expectation.mismatch, scene.model, joints_rad, in_base)
+    deflection = deflection_columns(scene.expectation.mismatch, scene.model, joints_rad, in_base)
     camera_from_base = np.swapaxes(geometry.base_from_camera[:, :3, :3], -1, -2)
-    return Caps(geometry, unit, np.concatenate(shares, axis=-1), camera_from_base @ droop)
+    return Caps(geometry, unit, np.concatenate(shares, axis=-1), camera_from_base @ deflection)
 
 
 def shot_rows(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> FloatArray:
@@ -152,10 +154,14 @@ def shot_rows(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> FloatAr
     return np.concatenate([np.pad(part, ((0, 0), (0, deepest - part.shape[1]), (0, 0))) for part in rows])
 
 
+def layout_of(scene: Scene) -> Layout:
+    """Where each of the P unknowns sits."""
+    return scene.problem(np.zeros((0, scene.model.n_joints)), np.zeros(0, dtype=np.int64)).layout
+
+
 def n_columns(scene: Scene) -> int:
     """P + q."""
-    layout = scene.problem(np.zeros((0, scene.model.n_joints)), np.zeros(0, dtype=np.int64)).layout
-    return layout.size + scene.model.n_joints + scene.disturbance.size
+    return layout_of(scene).size + len(compliance_terms(scene.model)) + len(scene.disturbance.columns)
 
 
 def pose_covariance_mm2(scene: Scene, geometry: Geometry) -> FloatArray:

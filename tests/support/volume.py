@@ -15,6 +15,7 @@ from acquire.sphere import fit_fixed_radius
 from acquire.visibility import CameraView, camera_view
 from calibrate.camera_error import correction_in_camera_mm
 from calibrate.observations import Observations, SphereShot
+from calibrate.robot_terms import deflection_rad
 from calibrate.solve import Solved
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import mdh, se3
@@ -33,6 +34,10 @@ _BARS = {
     "bar3": [((0, 0, -40), (0, 1, 0)), ((0, 40, 0), (1, 0.1, 0)), ((20, -20, 60), (-0.1, 0.55, 0.83))],
     "bar1": [((0, 0, 0), (0.4, 0.8, 0.4))],
 }
+_CORNERS = [(-200, -220, -110), (210, -190, -60), (10, 240, 150), (190, 200, -130), (-180, 60, 170)]
+ARTEFACTS = ("one", "two", "bar1", "six", "bar3", "three", "five")
+"""METHOD.md 4's: a single sphere, a bar whose length nobody knows, one bar, the six places of bar3 without its lengths,
+a bar in three orientations, three and five spheres of a frame with all their lengths."""
 UNSEEN = {
     "T": (640.0, -330.0, 130.0),
     "U": (1120.0, -320.0, 190.0),
@@ -61,19 +66,31 @@ def volume_cell(
     """A random truth with the spheres of an artefact and the unseen places."""
     rng = np.random.default_rng([seed, 35])
     model = load_robot_model(model_name)
-    places: dict[str, FloatArray] = {}
-    lengths = []
-    for i, (offset, direction) in enumerate(_BARS[artefact]):
-        half = np.array(direction, dtype=np.float64) / np.linalg.norm(direction) * bar_mm / 2
-        first, second = f"{'ACE'[i]}", f"{'BDF'[i]}"
-        places[first], places[second] = _MIDDLE + offset - half, _MIDDLE + offset + half
-        lengths.append((first, second))
+    places, lengths = _artefact(artefact, bar_mm)
     calibration = tuple(places)
     places |= {name: np.array(place) for name, place in UNSEEN.items()}
     truth = random_truth(model, rng, spheres={n: SphereTruth((p[0], p[1], p[2]), DIAMETER_MM) for n, p in places.items()}, sizes=sizes)
-    error_mm = rng.normal(0, LENGTH_U_MM / 2)
-    cell = _cell(model_name, places, [(a, b, float(np.linalg.norm(places[a] - places[b])) + error_mm) for a, b in lengths])
+    # a bar is one artefact with one certificate; the lengths of a frame are measured one by one
+    error_mm = np.full(len(lengths), rng.normal(0, LENGTH_U_MM / 2))
+    if artefact in {"three", "five"}:
+        error_mm = rng.normal(0, LENGTH_U_MM / 2, len(lengths))
+    certified = [(a, b, float(np.linalg.norm(places[a] - places[b]) + error)) for (a, b), error in zip(lengths, error_mm, strict=True)]
+    cell = _cell(model_name, places, certified)
     return VolumeCell(SimulatedCell(truth, model), cell, model, calibration)
+
+
+def _artefact(name: str, bar_mm: float) -> tuple[dict[str, FloatArray], list[tuple[str, str]]]:
+    """Places of an artefact's spheres, and which of them have a certified length between them."""
+    if name in {"one", "three", "five"}:
+        n = {"one": 1, "three": 3, "five": 5}[name]
+        frame = {letter: _MIDDLE + corner for letter, corner in zip("ABCDE"[:n], _CORNERS, strict=False)}
+        return ({"A": _MIDDLE}, []) if n == 1 else (frame, list(combinations(frame, 2)))
+    bars = _BARS[{"two": "bar1", "six": "bar3"}.get(name, name)]
+    places: dict[str, FloatArray] = {}
+    for i, (offset, direction) in enumerate(bars):
+        half = np.array(direction, dtype=np.float64) / np.linalg.norm(direction) * bar_mm / 2
+        places["ACE"[i]], places["BDF"[i]] = _MIDDLE + offset - half, _MIDDLE + offset + half
+    return places, [] if name in {"two", "six"} else [("ACE"[i], "BDF"[i]) for i in range(len(bars))]
 
 
 def random_shots(
@@ -115,11 +132,10 @@ def measured_centres(solved: Solved, observations: Observations) -> dict[str, Fl
     points: dict[str, list[FloatArray]] = {}
     starts: dict[str, list[FloatArray]] = {}
     for shot in observations.shots:
-        flange = (
-            mdh.base_from_flange(problem.model, shot.joints_rad, state.link_twists)
-            if problem.model and shot.joints_rad is not None
-            else shot.base_from_flange
-        )
+        flange = shot.base_from_flange
+        if problem.model is not None and shot.joints_rad is not None:
+            deflection = deflection_rad(problem.terms, state.terms_rad, problem.model, shot.joints_rad)
+            flange = mdh.base_from_flange(problem.model, shot.joints_rad, state.link_twists, deflection)
         base_from_camera = flange @ state.flange_from_camera
         corrected = shot.points_in_camera_mm + correction_in_camera_mm(problem.camera_error, state.camera_mm, shot.points_in_camera_mm)
         points.setdefault(shot.sphere, []).append(se3.apply(base_from_camera, corrected))
@@ -167,5 +183,6 @@ def _cell(model_name: str, places: Mapping[str, FloatArray], lengths: Sequence[t
         "flange_from_camera": [list(row) for row in PAPER_FLANGE_FROM_CAMERA],
         "spheres": {n: {"diameter_mm": DIAMETER_MM, "expanded_uncertainty_mm": 0.001, "centre_in_base_mm": p.tolist()} for n, p in places.items()},
         "lengths": [{"between": [a, b], "length_mm": length, "expanded_uncertainty_mm": LENGTH_U_MM} for a, b, length in lengths],
+        "work_volume_mm": np.array([np.min(list(UNSEEN.values()), axis=0), np.max(list(UNSEEN.values()), axis=0)]).tolist(),
     }
     return parse_cell(dump_yaml(data).encode(), path=Path("volume.yaml"))
