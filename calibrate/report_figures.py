@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 def make_result(
     solved: Solved,
     *,
+    method: str,
     cell: Cell,
     sessions: Sequence[Session],
     n_shots: int,
@@ -72,7 +73,7 @@ def make_result(
     )
     result = Calibration(
         id="",
-        method="clouds",
+        method=method,
         model=problem.model if has_joints else None,
         link_twists=state.link_twists,
         flange_from_camera=state.flange_from_camera,

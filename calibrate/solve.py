@@ -26,7 +26,7 @@ from calibrate.result import Calibration
 from calibrate.start import start_from_centres
 from calibrate.start_arcs import start_from_arcs
 from calibrate.validation import Prediction, cross_validate, predict, shot_centre_covariance_mm2, squared_errors_mm2
-from drivers.errors import DataError
+from drivers.errors import DataError, SettingsError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
 
@@ -49,6 +49,8 @@ class CalibrationSettings:
 
     camera_error: str = "auto"
     """auto, none, affine, pillow or field."""
+    method: str = "clouds"
+    """clouds, or stepwise for the paper's solver."""
     priors: Priors = field(default_factory=Priors)
 
 
@@ -68,7 +70,7 @@ def calibrate(sessions: Sequence[Session], settings: CalibrationSettings | None 
     Raises:
         FileError: a file is broken, or a shot does not fit the cell.
         DataError: the data cannot be used: no sphere found, too few shots, wrong units, no solution.
-        SettingsError: an unknown camera error model.
+        SettingsError: an unknown camera error model or method, or two that do not go together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -87,6 +89,7 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
     solved, compared = solve_observations(observations, cell, model, settings)
     return make_result(
         solved,
+        method=settings.method,
         cell=cell,
         sessions=sessions,
         n_shots=observations.n_shots,
@@ -124,6 +127,12 @@ def solve_observations(
     observations: Observations, cell: Cell, model: RobotModel | None, settings: CalibrationSettings
 ) -> tuple[Solved, dict[str, float]]:
     """Solve with the camera error model asked for, or with the simplest that held-out shots do not tell from the best."""
+    if settings.method == "stepwise":
+        from calibrate.stepwise_sessions import solve_stepwise_sessions
+
+        return solve_stepwise_sessions(observations, cell, model, settings), {}
+    if settings.method != "clouds":
+        raise SettingsError(f"unknown method {settings.method!r}", remedy="Choose clouds or stepwise.")
     models = _candidates(observations, cell, settings)
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
     start, keep, rejected = _start(first, cell)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,10 +69,11 @@ def shot_centres_in_base_mm(problem: Problem, state: State, geometry: Geometry) 
     return se3.apply(geometry.base_from_camera, centres)
 
 
-def cross_validate(solution: Solution, n_folds: int = N_FOLDS) -> Prediction:
+def cross_validate(solution: Solution, n_folds: int = N_FOLDS, solve: Callable[[NDArray[np.int64]], State] | None = None) -> Prediction:
     """Every shot predicted by a solve without its fold; folds go by scan, and by pose where joints were repeated.
 
-    The noise model of the whole solve is kept; nothing else of it is.
+    The noise model of the whole solve is kept; nothing else of it is. Another solver gives, as `solve`, the state that it
+    finds from the shots of some indices.
     """
     problem = solution.problem
     fold = folds_of(problem, n_folds)
@@ -85,14 +87,18 @@ def cross_validate(solution: Solution, n_folds: int = N_FOLDS) -> Prediction:
             inside = inside_seen
         if not len(inside):
             continue
-        training = subset(problem, outside)
-        start = without_pose_noise(solution.state, training.n_scans)
-        solved = solve_clouds(training, start, solution.noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM)
-        found = predict(subset(problem, inside), solved.state)
+        state = _solved_on(solution, outside) if solve is None else solve(outside)
+        found = predict(subset(problem, inside), state)
         error[inside], centres[inside] = found.centre_error_mm, found.centres_in_base_mm
         squares[inside], n_points[inside] = found.sum_of_squares_mm2, found.n_points
     seen = n_points > 0
     return Prediction(error[seen], centres[seen], squares[seen], n_points[seen])
+
+
+def _solved_on(solution: Solution, keep: NDArray[np.int64]) -> State:
+    training = subset(solution.problem, keep)
+    start = without_pose_noise(solution.state, training.n_scans)
+    return solve_clouds(training, start, solution.noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM).state
 
 
 def folds_of(problem: Problem, n_folds: int) -> NDArray[np.int64]:

@@ -28,9 +28,10 @@ class CameraErrorChoice(StrEnum):
 
 
 class Method(StrEnum):
-    """Solvers that exist."""
+    """Solvers: every point at once, or the paper's Algorithm 1 on sphere centres."""
 
     clouds = "clouds"
+    stepwise = "stepwise"
 
 
 def centres(
@@ -104,7 +105,7 @@ def calibrate(
         require_writable(out)
         read = [read_session(folder) for folder in sessions]
         with run.console.progress("calibrating"):
-            calibration = calibrate_sessions(read, CalibrationSettings(camera_error=camera_error.value))
+            calibration = calibrate_sessions(read, CalibrationSettings(camera_error=camera_error.value, method=method.value))
         former = save_calibration(calibration, out)
         if former is not None:
             run.console.note(f"the earlier {out} was kept as {former}")

@@ -98,8 +98,8 @@ SECTIONS = (
         "A sphere of 38.1 mm fitted with a free radius, before and after the correction that each calibration found.",
         agree="A depth error bends the sphere, most where the camera is near; corrected points read close to the certified diameter.",
         differ="The paper's camera always reads large, by up to 0.4 mm, less so far away. With the simulated k a sphere reads small; with the other "
-        "sign, which is that of the k found on hardware (Table 4), it reads large and falls with z, as in the paper's Fig 5. Method 1 fits k to centres "
-        "of free-radius fits, which move with the bend, and overshoots: the paper too finds its deviation not completely eliminated.",
+        "sign, which is that of the k found on hardware (Table 4), it reads large and falls with z, as in the paper's Fig 5. Method 1 fits k to "
+        "centres of free-radius fits, which move with the bend, and overshoots: the paper too finds its deviation not completely eliminated.",
         figures=("figure5", "figure11"),
     ),
     Section(
