@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calibrate.datum import ARM_MM
 from calibrate.export_notes import commented, number, numbers, provenance, robot_of
 from calibrate.export_target_files import Target, json_data
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.inverse import all_branches, inverse_near
+from drivers.kinematics.jacobian import joint_jacobian
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
@@ -142,19 +144,35 @@ def _correct(calibration: Calibration, model: RobotModel, target: Target, near: 
 
 
 def _solve(calibration: Calibration, model: RobotModel, pose: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Axis angles of the calibrated robot, whatever it consists of.
+    """Axis angles of the calibrated robot, whatever it consists of: beside the nominal ones, or else the nearest there are."""
+    beside = _newton(calibration, model, pose, nominal)
+    if beside is not None and mdh.within_limits(model, beside):
+        return beside
+    # the inverse knows limits and other postures, of link twists alone; Newton takes what else bends the robot from there
+    found = inverse_near(model, se3.inverse(calibration.datum.base_from_solver) @ pose, nominal, calibration.link_twists)
+    joints = _newton(calibration, model, pose, found)
+    if joints is None or not mdh.within_limits(model, joints):
+        remedy = "Move the target away from limits and singular poses."
+        raise DataError("the corrected robot does not reach the pose within its limits", remedy=remedy)
+    return joints
 
-    The inverse knows the link twists; what else bends the robot is taken out by aiming beside the pose by as much as was missed.
-    """
-    aim = se3.inverse(calibration.datum.base_from_solver) @ pose
-    near = nominal
+
+def _newton(calibration: Calibration, model: RobotModel, pose: FloatArray, joints_rad: FloatArray) -> FloatArray | None:
+    """Axis angles that reach a pose to rounding, by Newton steps from some that nearly do; None where there are none beside them."""
+    joints = joints_rad.copy()
+    weight = np.array([1.0, 1, 1, ARM_MM, ARM_MM, ARM_MM])
     for _ in range(_ROUNDS):
-        near = inverse_near(model, aim, near, calibration.link_twists)
-        miss = se3.log(se3.inverse(calibration.base_from_flange(near)) @ pose)
+        flange = calibration.base_from_flange(joints)
+        miss = se3.log(se3.inverse(flange) @ pose)
         if np.abs(miss[:3]).max() < _ARRIVED_MM and np.abs(miss[3:]).max() < _ARRIVED_RAD:
-            return near
-        aim = aim @ se3.exp(miss)
-    raise DataError("the corrected robot is not found to reach the pose", remedy="Choose a pose farther from a singular one.")
+            return joints
+        in_solver = se3.inverse(calibration.datum.base_from_solver) @ flange
+        jacobian = se3.adjoint(se3.inverse(in_solver)) @ joint_jacobian(model, joints, calibration.link_twists)
+        step = np.linalg.lstsq(weight[:, None] * jacobian, weight * miss, rcond=1e-8)[0]
+        if np.abs(joints + step - joints_rad).max() > LARGEST_CHANGE_RAD:
+            return None
+        joints = joints + step
+    return None
 
 
 def _refuse_other_posture(change_rad: FloatArray) -> None:

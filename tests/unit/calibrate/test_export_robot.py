@@ -14,16 +14,14 @@ import pytest
 from calibrate import Calibration
 from calibrate.export import ROBOT_FORMATS, TARGET_FORMATS, export_text
 from calibrate.export_residual import corners
-from calibrate.robot_terms import RobotTerm
 from drivers.errors import SettingsError
 from drivers.kinematics.se3 import FloatArray
 from drivers.models import load_robot_model, shipped_models
-from tests.support.exporting import assert_same_poses, calibration_of, seen_poses, shipped_calibration
+from tests.support.exporting import YieldingCalibration, assert_same_poses, calibration_of, seen_poses, shipped_calibration
 from tests.support.foreign_readers import Urdf, from_xyz_rpy_m, load_plain_yaml, mdh_pose_mm, transform_mm
 from tests.support.synthetic import paper_robot
 
 UR_ROBOTS = ("ur5e", "ur10e")
-YIELDING = (RobotTerm(1, 6), RobotTerm(2, 6)), (3e-4, -2e-4)
 
 
 def named(joints: FloatArray) -> dict[str, float]:
@@ -74,18 +72,18 @@ def test_urdf_limits_are_those_of_the_model() -> None:
 
 
 @pytest.mark.parametrize("name", shipped_models())
-@pytest.mark.parametrize("terms", [((), ()), YIELDING], ids=["rigid", "yielding"])
+@pytest.mark.parametrize("kind", [Calibration, YieldingCalibration])
 @pytest.mark.parametrize("file_format", ["mdh", "mdh-full"])
-def test_an_mdh_table_is_as_near_as_it_says(name: str, terms: tuple[tuple[RobotTerm, ...], tuple[float, ...]], file_format: str) -> None:
+def test_an_mdh_table_is_as_near_as_it_says(name: str, kind: type[Calibration], file_format: str) -> None:
     model = load_robot_model(name)
-    calibration = calibration_of(model, terms=terms[0], terms_rad=terms[1])
+    calibration = calibration_of(model, kind=kind)
     exported = export_text(calibration, file_format)
     joints = seen_poses(calibration, 60)
     table = np.stack([mdh_pose_mm(exported.text, q, model.coupling) for q in joints])
     assert_as_near_as_said(calibration, table, joints, exported.text)
     residual = exported.residual
     assert residual is not None
-    if file_format == "mdh-full" and not terms[0]:
+    if file_format == "mdh-full" and kind is Calibration:
         assert residual.arm_max_mm < 1e-6
         assert_same_poses(table, calibration.base_from_flange(joints))
     if file_format == "mdh":
@@ -188,7 +186,7 @@ def test_ur_kinematics_are_for_ur_robots(name: str) -> None:
 def test_a_robot_that_yields_is_exported_with_what_is_left() -> None:
     """Constant transforms take over the constant part of the deflection, and the text says what remains."""
     model = load_robot_model("abb_irb1410")
-    calibration = calibration_of(model, terms=YIELDING[0], terms_rad=YIELDING[1])
+    calibration = calibration_of(model, kind=YieldingCalibration)
     exported = export_text(calibration, "urdf")
     joints = seen_poses(calibration, 60)
     urdf = Urdf(exported.text)

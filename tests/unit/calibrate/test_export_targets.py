@@ -16,12 +16,11 @@ from calibrate import Calibration
 from calibrate.export import export_text
 from calibrate.export_target_files import Target, parse_targets
 from calibrate.export_targets import correct_targets
-from calibrate.robot_terms import RobotTerm
 from drivers.errors import DataError, FileError, SettingsError, SpherecalError
 from drivers.kinematics import mdh
 from drivers.kinematics.se3 import FloatArray
 from drivers.models import load_robot_model
-from tests.support.exporting import assert_same_poses, calibration_of, seen_poses, shipped_calibration
+from tests.support.exporting import YieldingCalibration, assert_same_poses, calibration_of, seen_poses, shipped_calibration
 from tests.support.foreign_readers import rapid_numbers
 
 ROBOTS = ("abb_irb1410", "ur5e")
@@ -82,7 +81,7 @@ def test_the_real_robot_reaches_the_nominal_pose(name: str, file_format: str, re
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_robot_that_yields_reaches_it_too(name: str) -> None:
-    calibration = calibration_of(load_robot_model(name), terms=(RobotTerm(1, 6), RobotTerm(2, 6)), terms_rad=(1e-3, -5e-4))
+    calibration = calibration_of(load_robot_model(name), kind=YieldingCalibration)
     joints = regular_poses(calibration, 6)
     corrected = correct_targets(calibration, parse_targets(joints_csv(joints), 6, file="x"))
     reached = calibration.base_from_flange(np.array([c.joints_rad for c in corrected]))
@@ -203,6 +202,24 @@ def test_another_posture_is_no_correction() -> None:
     stretched = Target("s", "line 2", joints_rad=np.array([0.461, -0.28, 0.01, 0.791, -0.559, 0.55]))
     with pytest.raises(DataError, match=r"target s: the corrected robot reaches the pose only in another posture \(axis \d [-+]\d+ degrees\)"):
         correct_targets(calibration, [stretched])
+
+
+def test_corrected_angles_keep_the_limits_or_are_refused() -> None:
+    calibration = shipped_calibration("abb_irb1410")
+    model = load_robot_model("abb_irb1410")
+    refused: list[str] = []
+    for axis in range(6):
+        for limit in model.joint_limits_rad[axis]:
+            joints = np.array([0.3, 0.1, 0.2, 0.9, -0.8, 0.5])
+            joints[axis] = limit
+            try:
+                (c,) = correct_targets(calibration, [Target("edge", "line 2", joints_rad=joints)])
+            except DataError as error:
+                refused.append(str(error))
+            else:
+                assert mdh.within_limits(model, c.joints_rad)
+    assert len(refused) >= 4
+    assert all("limits" in message or "another posture" in message for message in refused)
 
 
 def test_names_that_rapid_cannot_take_are_told() -> None:
