@@ -39,6 +39,7 @@ __all__ = [
 _METRES_BELOW_MM = 5.0
 # support of a flat table, as a share of a whole sphere's, stays below
 _WORTH_A_LOOK = 0.33
+_ELSEWHERE = 5.0
 
 
 def find_sphere(
@@ -80,6 +81,15 @@ def find_spheres(
     """
     settings = settings or SphereSettings()
     predicted = None if predicted_centre_in_camera_mm is None else np.asarray(predicted_centre_in_camera_mm, dtype=np.float64)
+    try:
+        return _find_near(xyz_mm, radius_mm, settings, predicted)
+    except SphereNotFound:
+        if predicted is not None:
+            _refuse_elsewhere(xyz_mm, radius_mm, settings, predicted)
+        raise
+
+
+def _find_near(xyz_mm: NDArray[Any], radius_mm: float, settings: SphereSettings, predicted: FloatArray | None) -> tuple[SphereFinding, ...]:
     reach = settings.search_radius_mm + 1.5 * radius_mm
     scan = valid_points(xyz_mm, centre_mm=predicted, reach_mm=reach, furthest_mm=settings.furthest_mm)
     _check_scan(scan, settings, predicted)
@@ -92,6 +102,20 @@ def find_spheres(
     raise refused or SphereNotFound(
         "no_sphere", f"no surface of radius {radius_mm:.3f} mm among {len(scan.points_mm)} points{_near_text(predicted)}", remedy=LOOK_REMEDY
     )
+
+
+def _refuse_elsewhere(xyz_mm: NDArray[Any], radius_mm: float, settings: SphereSettings, predicted: FloatArray) -> None:
+    """Raise the reason `far_from_prediction` where the scan holds one such sphere, further off than the search reaches.
+
+    Only up to some search radii: what is further away is rather another sphere of the cell.
+    """
+    try:
+        found = _find_near(xyz_mm, radius_mm, settings, None)
+    except SphereNotFound:
+        return
+    distance = float(np.linalg.norm(found[0].centre_in_camera_mm - predicted))
+    if len(found) == 1 and distance <= _ELSEWHERE * settings.search_radius_mm:
+        raise _far(distance, settings)
 
 
 def _check_scan(scan: ValidPoints, settings: SphereSettings, predicted: FloatArray | None) -> None:
@@ -158,11 +182,15 @@ def _check_prediction(finding: SphereFinding, predicted: FloatArray | None, sett
         return
     distance = float(np.linalg.norm(finding.centre_in_camera_mm - predicted))
     if distance > settings.search_radius_mm:
-        raise SphereNotFound(
-            "far_from_prediction",
-            f"the nearest sphere is {distance:.1f} mm from its predicted place, {settings.search_radius_mm:.1f} mm allowed",
-            remedy="Check centre_in_base_mm and flange_from_camera in the cell file.",
-        )
+        raise _far(distance, settings)
+
+
+def _far(distance_mm: float, settings: SphereSettings) -> SphereNotFound:
+    return SphereNotFound(
+        "far_from_prediction",
+        f"the sphere is {distance_mm:.1f} mm from its predicted place, {settings.search_radius_mm:.1f} mm allowed",
+        remedy="Check centre_in_base_mm and flange_from_camera in the cell file.",
+    )
 
 
 def _refuse_hollow(scan: ValidPoints, radius_mm: float, settings: SphereSettings) -> None:

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.qualify
 
 @pytest.mark.parametrize("block", range(10))
 def test_spheres_are_found_and_never_wrongly(block: int) -> None:
-    for seed in range(100 * block, 100 * (block + 1)):
+    for seed in range(50 * block, 50 * (block + 1)):
         scene = random_scene(seed)
         told = ""
         try:
@@ -29,7 +29,7 @@ def test_spheres_are_found_and_never_wrongly(block: int) -> None:
 
 @pytest.mark.parametrize("block", range(5))
 def test_nothing_is_found_where_no_sphere_is(block: int) -> None:
-    for seed in range(100 * block, 100 * (block + 1)):
+    for seed in range(50 * block, 50 * (block + 1)):
         scene = random_scene(seed, with_sphere=False)
         with pytest.raises(SphereNotFound):
             find_sphere(scene.xyz_mm, radius_mm=scene.radius_mm, predicted_centre_in_camera_mm=scene.predicted_mm)

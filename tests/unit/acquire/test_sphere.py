@@ -208,10 +208,13 @@ def test_refusals_name_their_reason(name: str, xyz: np.ndarray, reason: str) -> 
     assert found in {reason} | others.get(name, set())
 
 
-def test_a_wrong_prediction_finds_nothing_and_says_where_it_looked() -> None:
+def test_a_wrong_prediction_is_told_from_a_missing_sphere() -> None:
     xyz = frame([(CENTRE, RADIUS)], surfaces=[table(380)])
-    with pytest.raises(SphereNotFound, match="flat"):
+    with pytest.raises(SphereNotFound, match=r"150\.\d mm from its predicted place") as caught:
         find_sphere(xyz, radius_mm=RADIUS, predicted_centre_in_camera_mm=np.add(CENTRE, (150.0, 0, 0)))
+    assert caught.value.reason == "far_from_prediction"
+    # half a metre away stands another sphere, and the one that is looked for is not seen
+    assert reason_of(xyz, predicted_centre_in_camera_mm=np.add(CENTRE, (0, 0, 500.0))) == "too_few_points"
 
 
 @pytest.mark.parametrize("hidden", [0.3, 0.5])
