@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.design_aim import Aim
 from calibrate.design_search import IndexArray, Information, Pool, exchanged, greedy, mean_square, scores
-from calibrate.design_shots import IntArray, Scene, layout_of, n_columns, prior_sigma, shot_rows
+from calibrate.design_shots import IntArray, Scene, actual_covariance, layout_of, n_columns, prior_sigma, shot_rows
 from drivers.errors import SettingsError
 from drivers.kinematics.se3 import FloatArray
 
@@ -61,7 +61,8 @@ def information_before(scene: Scene) -> Information:
     """Priors and certified lengths alone."""
     sigma = prior_sigma(scene)
     layout = layout_of(scene)
-    start = Information(np.diag(sigma**-2.0), np.zeros((len(sigma), n_columns(scene) - len(sigma))))
+    none = np.zeros((len(sigma), n_columns(scene) - len(sigma)))
+    start = Information(np.diag(sigma**-2.0), none, sigma, actual_covariance(scene))
     rows = np.zeros((len(scene.lengths), n_columns(scene)))
     for row, length in zip(rows, scene.lengths, strict=True):
         way = scene.centres_in_base_mm[length.second] - scene.centres_in_base_mm[length.first]
@@ -84,7 +85,7 @@ def predicted_of(information: Information, aim: Aim, n_shots: int) -> Predicted:
     return Predicted(
         n_shots=n_shots,
         length_rms_mm=float(np.sqrt(lengths.total_mm2)),
-        length_noise_rms_mm=float(np.sqrt(lengths.noise_mm2)),
+        length_noise_rms_mm=float(np.sqrt(lengths.modelled_mm2)),
         length_mismatch_rms_mm=float(np.sqrt(lengths.mismatch_mm2)),
         centre_rms_mm=centre if np.isfinite(centre) else None,
     )

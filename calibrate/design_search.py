@@ -8,7 +8,7 @@ no inverse of the whole; the state itself is made anew from its sum after every 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +35,17 @@ class Information:
     """(P, P)."""
     push: FloatArray
     """(P, q) of the disturbances on the gradient."""
+    prior_sigma: FloatArray
+    """(P,) that the solve believes."""
+    actual_covariance: FloatArray
+    """(P, P) how large the unknowns really are."""
 
     def plus(self, rows: FloatArray, sign: float = 1.0) -> Information:
         """With the rows (..., P + q) of further shots, or without them where the sign is -1."""
         flat = rows.reshape(-1, rows.shape[-1])
         size = len(self.hessian)
         added = flat[:, :size].T @ flat
-        return Information(self.hessian + sign * added[:, :size], self.push + sign * added[:, size:])
+        return replace(self, hessian=self.hessian + sign * added[:, :size], push=self.push + sign * added[:, size:])
 
     @property
     def factor(self) -> FloatArray:
@@ -53,29 +57,39 @@ class Information:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """Mean squares of an aim: what noise and priors leave, and what unmodelled physics adds."""
+    """Mean squares of an aim: what noise and wrong guesses leave, and what unmodelled physics adds."""
 
-    noise_mm2: float
+    modelled_mm2: float
     mismatch_mm2: float
 
     @property
     def total_mm2(self) -> float:
         """Both."""
-        return self.noise_mm2 + self.mismatch_mm2
+        return self.modelled_mm2 + self.mismatch_mm2
 
 
 def mean_square(information: Information, gradients: FloatArray) -> Split:
-    """Mean over gradients (l, P + q) of their predicted variance."""
+    """Mean over gradients (l, P + q) of their expected squared error.
+
+    With priors of precision C in the solve and unknowns that are really of covariance D, the unknowns' errors have
+    `Sigma - Sigma (C - C D C) Sigma`: the noise of the data, and what the priors hold back.
+    """
     if not len(gradients):
         return Split(float("nan"), float("nan"))
     size, factor = len(information.hessian), information.factor
     spread = gradients[:, :size] @ factor
     left = gradients[:, size:] - spread @ (factor.T @ information.push)
-    return Split(float((spread**2).sum() / len(spread)), float((left**2).sum() / len(left)))
+    pulled = spread @ factor.T * information.prior_sigma**-2.0
+    too_wide = np.diag(information.prior_sigma**2) - information.actual_covariance
+    modelled = (spread**2).sum() - ((pulled @ too_wide) * pulled).sum()
+    return Split(float(modelled / len(spread)), float((left**2).sum() / len(left)))
 
 
 def scores(information: Information, gradients: FloatArray, rows: FloatArray) -> FloatArray:
-    """(m,) the criterion, in mm², after each of some candidates (m, r, P + q) alone is added."""
+    """(m,) the criterion, in mm², after each of some candidates (m, r, P + q) alone is added.
+
+    The unknowns are taken as large as the solve's priors here, which is the safe side for a choice.
+    """
     size, factor, n = len(information.hessian), information.factor, len(gradients)
     spread = gradients[:, :size] @ factor
     push = factor.T @ information.push

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.camera_error import CameraError
-from calibrate.design_mismatch import CameraDisturbance, Mismatch, camera_disturbance, deflection_columns
+from calibrate.design_mismatch import CameraDisturbance, Physics, camera_disturbance, deflection_columns, modelled_covariance_mm2
 from calibrate.normal import NoiseModel
 from calibrate.problem import Geometry, Layout, LengthConstraint, Priors, Problem, State, linearise_geometry
-from calibrate.robot_terms import compliance_terms
+from calibrate.robot_terms import arm_terms
 from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -41,7 +41,7 @@ class Expectation:
     n_points: int = 1000
     """Points on a sphere per shot."""
     priors: Priors = field(default_factory=Priors)
-    mismatch: Mismatch = field(default_factory=Mismatch)
+    physics: Physics = field(default_factory=Physics)
     hand_eye_mm: float = 50.0
     hand_eye_rad: float = 0.2
     centre_mm: float = 50.0
@@ -72,7 +72,7 @@ class Scene:
     @property
     def disturbance(self) -> CameraDisturbance:
         """What the camera may do unmodelled."""
-        return camera_disturbance(self.expectation.mismatch, self.camera_box_mm, self.camera_error)
+        return camera_disturbance(self.expectation.physics, self.camera_box_mm, self.camera_error)
 
     def problem(self, joints_rad: FloatArray, sphere: IntArray) -> Problem:
         """The problem (without points) of shots with joints (m, n) at spheres (m,), one scan each."""
@@ -139,7 +139,7 @@ def ideal_caps(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> Caps:
     offset = -np.ones((*unit.shape[:2], 1))
     shares = [unit, basis * unit[..., axis], offset, scene.disturbance.shares(points, unit)]
     in_base = scene.centres_in_base_mm[sphere]
-    deflection = deflection_columns(scene.expectation.mismatch, scene.model, joints_rad, in_base)
+    deflection = deflection_columns(scene.expectation.priors, scene.model, joints_rad, in_base)
     camera_from_base = np.swapaxes(geometry.base_from_camera[:, :3, :3], -1, -2)
     return Caps(geometry, unit, np.concatenate(shares, axis=-1), camera_from_base @ deflection)
 
@@ -161,7 +161,7 @@ def layout_of(scene: Scene) -> Layout:
 
 def n_columns(scene: Scene) -> int:
     """P + q."""
-    return layout_of(scene).size + len(compliance_terms(scene.model)) + len(scene.disturbance.columns)
+    return layout_of(scene).size + len(arm_terms(scene.model)) + scene.disturbance.n_columns
 
 
 def pose_covariance_mm2(scene: Scene, geometry: Geometry) -> FloatArray:
@@ -184,6 +184,17 @@ def prior_sigma(scene: Scene) -> FloatArray:
     offset = [e.priors.radius_offset_mm]
     centres = np.full(3 * len(scene.radius_mm), e.centre_mm)
     return np.concatenate([links, hand_eye, scene.camera_error.prior_sigma_mm, offset, scene.radius_sigma_mm, centres])
+
+
+def actual_covariance(scene: Scene) -> FloatArray:
+    """(P, P) of how large the unknowns really are."""
+    physics, layout = scene.expectation.physics, layout_of(scene)
+    sigma = prior_sigma(scene)
+    sigma[layout.links] = np.tile([physics.link_mm] * 3 + [physics.link_rad] * 3, scene.model.n_joints)
+    sigma[layout.radius_offset] = physics.radius_offset_mm
+    actual = np.diag(sigma**2)
+    actual[layout.camera, layout.camera] = modelled_covariance_mm2(physics, scene.camera_error)
+    return actual
 
 
 def _rows_of(scene: Scene, caps: Caps) -> FloatArray:
