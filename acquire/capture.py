@@ -41,13 +41,13 @@ from acquire.events import (
     Stop,
 )
 from acquire.exposure import Exposure, average, expose
-from acquire.motion import Stillness, change_rad, halt, move, read_safely, remaining_rad, settle
+from acquire.motion import RobotUnsettled, Stillness, change_rad, halt, measured_joints, move, read_safely, remaining_rad, settle, unsettled
 from acquire.plan import Plan, PlannedPose
 from acquire.session import SessionWriter
 from acquire.sighting import base_from_flange_of, look_for, predicted_centre_in_camera_mm, prediction_error_mm
 from acquire.sphere import SphereNotFound
 from acquire.way import Way
-from drivers.errors import CameraError, MotionRefused, RobotTimeout, SettingsError, SpherecalError
+from drivers.errors import CameraError, MotionRefused, SettingsError, SpherecalError
 from drivers.files.shots import Shot
 from drivers.kinematics.mdh import RobotModel
 from drivers.protocols import Devices, Robot, RobotState
@@ -93,10 +93,6 @@ def _stop(robot: Robot, error: BaseException) -> None:
         robot.stop()
     except SpherecalError as second:
         error.add_note(f"and the robot could not be stopped: {second}")
-
-
-class RobotUnsettled(RobotTimeout):
-    """The robot is at its target and does not come to rest."""
 
 
 class _Interrupted(Exception):
@@ -219,7 +215,7 @@ class _Run:
             yield from self._go(pose)
             stillness = settle(self._robot, self._settings.motion)
             if not stillness.settled:
-                raise _unsettled(stillness)
+                raise unsettled(stillness)
             yield from self._tell(Settled(pose.id, stillness.stillness_rad, stillness.seconds))
             exposure = yield from self._expose(pose)
         except (MotionRefused, RobotUnsettled, CameraError) as error:
@@ -266,7 +262,7 @@ class _Run:
         """Look for the sphere and record the shot, good or not."""
         after = read_safely(self._robot)
         xyz_mm = average(exposure.frames)
-        joints_rad = _measured(before, after)
+        joints_rad = measured_joints(before, after)
         moved = change_rad(after, before.last)
         if moved > self._settings.motion.still_tolerance_rad or after.moving:
             yield from self._fail(pose, f"the robot moved by {moved:.2g} rad during the exposure", before, exposure, xyz_mm)
@@ -332,17 +328,3 @@ class _Run:
 def _is_of_the_pose(error: MotionRefused | RobotUnsettled | CameraError) -> bool:
     """Whether another pose may well go better."""
     return not isinstance(error, CameraError) or error.retryable
-
-
-def _unsettled(stillness: Stillness) -> RobotUnsettled:
-    return RobotUnsettled(
-        f"the robot did not come to rest within {stillness.seconds:.1f} s: its axes still move by {stillness.stillness_rad:.2g} rad",
-        remedy="Is somebody leaning on it, or does its brake or tool vibrate?",
-    )
-
-
-def _measured(before: Stillness, after: RobotState) -> FloatArray | None:
-    """Axis angles (n,) of the exposure: all readings that frame it, the settling ones weighing most."""
-    if before.joints_rad is None or after.joints_rad is None:
-        return before.joints_rad
-    return np.asarray((2 * before.joints_rad + after.joints_rad) / 3)

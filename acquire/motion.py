@@ -21,6 +21,10 @@ FloatArray = NDArray[np.float64]
 _REACH_MM = 1000.0
 
 
+class RobotUnsettled(RobotTimeout):
+    """The robot is at its target and does not come to rest."""
+
+
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
     """How to move and to wait."""
@@ -138,6 +142,21 @@ def settle(robot: Robot, settings: MotionSettings) -> Stillness:
             return Stillness(True, change, _mean_joints(states), states[-1], waited_s)
         if waited_s >= settings.settle_timeout_s:
             return Stillness(False, change, _mean_joints(states), states[-1], waited_s)
+
+
+def unsettled(stillness: Stillness) -> RobotUnsettled:
+    """The error that tells of a robot that did not come to rest."""
+    return RobotUnsettled(
+        f"the robot did not come to rest within {stillness.seconds:.1f} s: its axes still move by {stillness.stillness_rad:.2g} rad",
+        remedy="Is somebody leaning on it, or does its brake or tool vibrate?",
+    )
+
+
+def measured_joints(before: Stillness, after: RobotState) -> FloatArray | None:
+    """Axis angles (n,) of the exposure: all readings that frame it, the settling ones weighing most."""
+    if before.joints_rad is None or after.joints_rad is None:
+        return before.joints_rad
+    return np.asarray((2 * before.joints_rad + after.joints_rad) / 3)
 
 
 def change_rad(state: RobotState, other: RobotState) -> float:
