@@ -300,8 +300,10 @@ class _Run:
         exposure: Exposure | None = None,
         xyz_mm: NDArray[np.float32] | None = None,
     ) -> Shot:
-        """Put the pose's shot on disk; it takes the place of an earlier one of the same pose. The pose is done with."""
+        """Put the pose's shot on disk. It takes the place of an earlier one, but no failure that of a good shot."""
         earlier = self._last_by_id.get(pose.id)
+        if earlier is not None and earlier.status == "ok" and status != "ok":
+            earlier = None
         frames = () if exposure is None else exposure.frames
         shot = self._writer.append(
             sphere=pose.sphere,
@@ -319,7 +321,8 @@ class _Run:
             temperatures_c=frames[-1].temperatures_c if frames else None,
             approach=None if before is None else self._approach,
         )
-        self._last_by_id[pose.id] = shot
+        if status == "ok" or not self._is_done(pose):
+            self._last_by_id[pose.id] = shot
         self._counts[status] += 1
         self._in_hand, self._last_taken = None, pose
         return shot
