@@ -156,11 +156,11 @@ def stitching(
 
 
 def _stitched_figures(clouds_mm: FloatArray, radius_mm: float) -> tuple[float, float]:
-    """Error of the free diameter of the stitched clouds (m, n, 3), and rms distance from the best certified sphere."""
+    """Size of the error of the free diameter of stitched clouds (m, n, 3), and rms distance from the best certified sphere."""
     points = clouds_mm.reshape(-1, 3)
     centre, _ = fit_fixed_radius(points, radius_mm, _start(points, radius_mm))
     _, radius, _ = fit_free_radius(points, radius_mm, centre)
-    return 2 * (radius - radius_mm), float(np.sqrt(((np.linalg.norm(points - centre, axis=1) - radius_mm) ** 2).mean()))
+    return 2 * abs(radius - radius_mm), float(np.sqrt(((np.linalg.norm(points - centre, axis=1) - radius_mm) ** 2).mean()))
 
 
 def _section(name: str, stitched: dict[Variant, FloatArray], cell: StudyCell, n_clouds: int) -> StudyFigure:

@@ -27,8 +27,6 @@ def comparison(table_3: StudyTable, table_5: StudyTable, stitching: StudyTable) 
             rows.append((f"Table 5, method {method}, {figure}", row[f"paper_d_{figure}_mm"], row[f"d_{figure}_mm"], "in size", HARDWARE))
     for method in ("1", "2", "4"):
         row = stitching.row(f"{LABELS[method]}, free radius")
-        error = row["diameter_error_12_mm"]
-        ours = abs(error) if isinstance(error, float) else None
-        why = CONTRADICTED if method == "4" else HARDWARE
-        rows.append((f"Stitched diameter error, method {method}", row["paper_diameter_error_mm"], ours, "no" if method == "4" else "in size", why))
+        verdict = ("no", CONTRADICTED) if method == "4" else ("in size", HARDWARE)
+        rows.append((f"Stitched diameter error, method {method}", row["paper_diameter_error_mm"], row["diameter_error_12_mm"], *verdict))
     return StudyTable("comparison", ("figure", "printed_mm", "ours_mm", "comparable", "why"), tuple(rows))

@@ -71,7 +71,7 @@ SECTIONS = (
     Section(
         "Fig 7: noise",
         "The paper's noise times a level, camera error zero.",
-        agree="Methods 1 and 2 stay below method 3, and their spread rises with the noise.",
+        agree="The spread of methods 1 and 2 stays far below that of method 3 and rises with the noise.",
         differ="Method 4's sensitivity to noise is its gauge: e_mean of the variant that leaves it open runs away, its spread is that of method 2.",
         tables=("figure7",),
         figures=("figure7",),
