@@ -67,6 +67,8 @@ def solve_stepwise_sessions(observations: Observations, cell: Cell, model: Robot
     if cell.camera.kind == "line_profile":
         raise SettingsError("the stepwise method needs sphere centres, and a line profile shows none", remedy="Use --method clouds.")
     assembled = assemble(observations.shots, cell=cell, model=model, camera_error=_camera_error(cell, settings), priors=settings.priors)
+    # a length that the solver does not use must not make its result look better
+    assembled = replace(assembled, problem=replace(assembled.problem, lengths=()))
     centres = np.array([shot.centre_in_camera_mm for shot in assembled.shots], dtype=np.float64)
     guess = cell.flange_from_camera
     if guess is None:

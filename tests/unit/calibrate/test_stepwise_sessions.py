@@ -69,6 +69,18 @@ def test_pose_only_sessions_solve_the_hand_eye_block(pose_only_session: Path) ->
     assert np.abs(error[:3, :3] - np.eye(3)).max() < 2e-3
 
 
+def test_a_certified_length_is_not_used_and_the_verdict_says_so(tmp_path: Path) -> None:
+    cell, rng = paper_cell(), np.random.default_rng(10)
+    there = replace(cell, centre_in_base_mm=np.array([820.0, -250.0, 380.0]))
+    shots = {"A": draw_shots(cell, rng, 16, n_points=100), "B": draw_shots(there, rng, 16, n_points=100)}
+    length = ("A", "B", float(np.linalg.norm(cell.centre_in_base_mm - there.centre_in_base_mm)), 0.005)
+    folder = write_session(tmp_path / "s", cell, shots, flange_from_camera=cell.flange_from_camera, lengths=[length])
+    found = calibrate([read_session(folder)], STEPWISE)
+    assert any("no certified length was seen" in reason for reason in found.reasons)
+    apart = found.sphere_centres_in_base_mm["A"] - found.sphere_centres_in_base_mm["B"]
+    assert abs(float(np.linalg.norm(apart)) - length[2]) < 1.0
+
+
 @pytest.mark.parametrize("model", ["affine", "field"])
 def test_a_camera_error_that_is_not_the_papers_is_refused(session: Path, model: str) -> None:
     with pytest.raises(SettingsError, match=model):
