@@ -12,6 +12,7 @@ from acquire.cell import Cell
 from calibrate.camera_error import CameraError
 from calibrate.observations import SphereShot
 from calibrate.problem import LengthConstraint, Priors, Problem, State
+from calibrate.robot_terms import arm_terms, load_basis
 from drivers.errors import DataError
 from drivers.kinematics.mdh import RobotModel
 
@@ -49,9 +50,11 @@ def assemble(shots: Sequence[SphereShot], *, cell: Cell, model: RobotModel | Non
     scans = {key: i for i, key in enumerate(dict.fromkeys((s.session, s.scan_sha256) for s in shots))}
     points = np.concatenate([shot.points_in_camera_mm for shot in shots])
     sizes = [len(shot.points_in_camera_mm) for shot in shots]
+    terms = arm_terms(model) if model is not None and all(with_joints) else ()
+    joints = np.array([shot.joints_rad for shot in shots], dtype=np.float64) if all(with_joints) else None
     problem = Problem(
         model=model if all(with_joints) else None,
-        joints_rad=np.array([shot.joints_rad for shot in shots], dtype=np.float64) if all(with_joints) else None,
+        joints_rad=joints,
         base_from_flange=np.array([shot.base_from_flange for shot in shots]),
         scan=np.array([scans[s.session, s.scan_sha256] for s in shots], dtype=np.int64),
         sphere=np.array([names.index(s.sphere) for s in shots], dtype=np.int64),
@@ -67,6 +70,8 @@ def assemble(shots: Sequence[SphereShot], *, cell: Cell, model: RobotModel | Non
             if length.between[0] in names and length.between[1] in names
         ),
         priors=priors,
+        terms=terms,
+        load=load_basis(terms, model, joints) if model is not None and joints is not None else np.zeros((len(shots), 0, 0)),
         along_sight=cell.camera.kind == "area",
     )
     return Assembled(problem, tuple(shots), names)
@@ -81,6 +86,7 @@ def subset(problem: Problem, keep: NDArray[np.int64]) -> Problem:
         problem,
         joints_rad=None if problem.joints_rad is None else problem.joints_rad[keep],
         base_from_flange=problem.base_from_flange[keep],
+        load=problem.load[keep] if len(problem.load) else problem.load,
         scan=scan.astype(np.int64),
         sphere=problem.sphere[keep],
         points_in_camera_mm=problem.points_in_camera_mm[rows],

@@ -141,6 +141,11 @@ class PolynomialError:
         return tuple((2, t) for t in _degrees(self.degree)) + tuple((axis, t) for axis in (0, 1) for t in _degrees(self.lateral_degree))
 
     @property
+    def exponents(self) -> tuple[tuple[int, int, int], ...]:
+        """Degrees in x, y, z of every term."""
+        return tuple(degrees for _, degrees in self.terms)
+
+    @property
     def axis(self) -> NDArray[np.int64]:
         """Depth terms first, then x, then y."""
         return np.array([axis for axis, _ in self.terms], dtype=np.int64)

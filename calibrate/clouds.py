@@ -20,6 +20,8 @@ _LAST_ESTIMATE = 7
 """Passes in which the noise model is estimated anew; later ones hold it, so that the descent can end."""
 _STEP_TOLERANCE_MM = 1e-8
 _STALL_TOLERANCE_MM = 1e-5
+_PATIENCE, _LAST_TOLERANCE_MM = 25, 1e-3
+"""A point that changes sides between two passes can keep a solve from its last digits: a micrometre is then enough."""
 _REBASE_TOLERANCE_MM = 1e-5
 _MAX_PASSES = 40
 
@@ -42,8 +44,26 @@ class Solution:
 
     @property
     def covariance(self) -> FloatArray:
-        """(P, P) of the unknowns, pose noise included."""
-        return normal.symmetric_inverse(self.reduced.hessian)
+        """(P, P) of the unknowns, pose noise included; deflection terms that were held are considered.
+
+        With S = -inv(H_xx) H_xc the estimate of the others follows a deflection c by S c (Schmidt 1966), so that their
+        covariance is inv(H_xx) + S Q S' and the cross covariance S Q, Q the prior of c.
+        """
+        layout = self.problem.layout
+        if self.problem.estimate_terms or not layout.n_terms:
+            return normal.symmetric_inverse(self.reduced.hessian)
+        held = np.zeros(layout.size, dtype=bool)
+        held[layout.terms] = True
+        free = ~held
+        inverse = normal.symmetric_inverse(self.reduced.hessian[np.ix_(free, free)])
+        follows = -inverse @ self.reduced.hessian[np.ix_(free, held)]
+        variance = self.problem.priors.term_sigma_rad(self.problem.terms) ** 2
+        result = np.zeros((layout.size, layout.size))
+        result[np.ix_(free, free)] = inverse + follows * variance @ follows.T
+        result[np.ix_(free, held)] = follows * variance
+        result[np.ix_(held, free)] = (follows * variance).T
+        result[np.ix_(held, held)] = np.diag(variance)
+        return result
 
 
 def solve_clouds(
@@ -78,7 +98,7 @@ def solve_clouds(
         state = state.moved(problem.layout, step, noise_step)
         previous_mm, step_mm = step_mm, _size_mm(problem, geometry, step)
         # rounding ends the descent of nearly noise-free data some digits above the tolerance
-        stalled = step_mm < _STALL_TOLERANCE_MM and step_mm > 0.3 * previous_mm
+        stalled = step_mm < (_STALL_TOLERANCE_MM if passes < _PATIENCE else _LAST_TOLERANCE_MM) and step_mm > 0.3 * previous_mm
         settled = (passes > 2 or not estimate_noise) and (step_mm < tolerance_mm or stalled)
     raise DataError(
         f"the solve did not settle in {_MAX_PASSES} passes (last step {step_mm:.2g} mm)",

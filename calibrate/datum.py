@@ -57,6 +57,17 @@ def datum_jacobian(datum: Datum, model: RobotModel | None, link_twists: FloatArr
     return np.asarray(-scale[:, None] * np.linalg.lstsq(design * scale, flat_jacobian, rcond=None)[0])
 
 
+def term_columns(model: RobotModel, steps: FloatArray, frames: FloatArray, load: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
+    """(m, 3, K): motion of points (m, 3) carried by the flange per coefficient of deflection terms with loads (m, n, K)."""
+    result = np.zeros((len(frames), 3, load.shape[-1]))
+    for i in range(model.n_joints):
+        if load[:, i].any():
+            turned = frames[:, i] @ steps[:, i]
+            motion = np.cross(turned[:, :3, 2], points_in_base_mm - turned[:, :3, 3])
+            result += motion[:, :, None] * load[:, i, None, :]
+    return result
+
+
 def link_columns(model: RobotModel, joints_rad: FloatArray, frames: FloatArray, link_twists: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
     """(m, 3, 6 n): motion of points (m, 3) carried by the flange per component of the link twists (n, 6)."""
     steps = mdh.link_transforms(model, joints_rad)

@@ -9,6 +9,7 @@ import numpy as np
 from calibrate.clouds import Solution
 from calibrate.normal import symmetric_inverse
 from calibrate.problem import Layout, Problem
+from calibrate.robot_terms import RobotTerm
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
@@ -37,10 +38,11 @@ class Identifiability:
 def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
     """Look at a solution's information about its geometric unknowns, priors of these left out."""
     layout = problem.layout
-    n = layout.n_geometric
+    n = layout.camera.stop
     information = _data_information(solution)
-    nuisance = information[n:, n:] + np.diag(_nuisance_prior(problem))
-    cross = information[:n, n:]
+    rest = np.arange(layout.radius_offset.start, layout.size)
+    nuisance = information[np.ix_(rest, rest)] + np.diag(_nuisance_prior(problem))
+    cross = information[:n, rest]
     projected = information[:n, :n] - cross @ symmetric_inverse(nuisance) @ cross.T
     scale = parameter_scale(layout)
     values = np.linalg.eigvalsh(projected / scale[:, None] / scale)[::-1]
@@ -75,12 +77,13 @@ def parameter_scale(layout: Layout) -> FloatArray:
     return np.array(twist * (layout.n_links + 1) + [1.0] * layout.n_camera)
 
 
-def parameter_names(layout: Layout, spheres: tuple[str, ...]) -> tuple[str, ...]:
+def parameter_names(layout: Layout, terms: tuple[RobotTerm, ...], spheres: tuple[str, ...]) -> tuple[str, ...]:
     """Names of all unknowns, with their units."""
     twist = ["rho_x_mm", "rho_y_mm", "rho_z_mm", "phi_x_rad", "phi_y_rad", "phi_z_rad"]
     names = [f"link{i + 1}.{part}" for i in range(layout.n_links) for part in twist]
     names += [f"hand_eye.{part}" for part in twist]
     names += [f"camera.{k}_mm" for k in range(layout.n_camera)]
+    names += [f"{term.name}_rad" for term in terms]
     names += ["radius_offset_mm"]
     names += [f"sphere.{name}.radius_mm" for name in spheres]
     names += [f"sphere.{name}.{axis}_mm" for name in spheres for axis in "xyz"]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibrate.problem import Geometry, Problem, State
 from drivers.kinematics.se3 import FloatArray
 
+_HELD_RAD = 1e-12
 PATCHES = 12
 """Independent patches that a shot's form error is counted as."""
 
@@ -199,6 +200,9 @@ def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     value[layout.links] = state.link_twists.ravel()
     precision[layout.camera] = problem.camera_error.prior_sigma_mm**-2.0
     value[layout.camera] = state.camera_mm
+    # terms that are not estimated are held by a prior that no data can move
+    precision[layout.terms] = priors.term_sigma_rad(problem.terms) ** -2.0 if problem.estimate_terms else _HELD_RAD**-2
+    value[layout.terms] = state.terms_rad
     precision[layout.radius_offset] = priors.radius_offset_mm**-2
     value[layout.radius_offset] = state.radius_offset_mm
     precision[layout.sphere_radius] = problem.radius_sigma_mm**-2.0

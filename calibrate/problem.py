@@ -3,7 +3,7 @@
 Residual of point i of shot j on sphere s: `|W_ij + e_j - c_s| - (R_s + dR + dR_s)`, W the corrected point in the base,
 e_j the displacement that the pose noise of the shot's scan causes at the sphere.
 
-Unknowns, in this order: link twists (6 n), hand-eye (6), camera coefficients (k), the shared radius offset dR (1), a
+Unknowns, in this order: link twists (6 n), hand-eye (6), camera coefficients (k), deflection terms (K), the shared radius offset dR (1), a
 radius deviation per sphere within its certificate (S), sphere centres (3 S). The pose noise is a nuisance twist per scan,
 `(t mm, w rad)` about the flange origin in base axes, with prior `diag(s_t² I, s_r² I)`: at the centre it displaces by
 `t + w x (c - f)`, which is METHOD.md's N_j = s_t² I + s_r² hat(l) hat(l)', and two spheres in one scan share it.
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.camera_error import CameraError
-from calibrate.datum import link_columns, twist_columns
+from calibrate.datum import link_columns, term_columns, twist_columns
+from calibrate.robot_terms import RobotTerm
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -32,6 +33,14 @@ class Priors:
     link_rho_mm: float = 1.0
     link_phi_rad: float = 2e-3
     radius_offset_mm: float = 0.1
+    deflection_rad: float = 1.5e-4
+    """Of an axis under gravity at full stretch."""
+    transmission_rad: float = 3e-5
+    """Amplitude of an axis' transmission error."""
+
+    def term_sigma_rad(self, terms: tuple[RobotTerm, ...]) -> FloatArray:
+        """(K,) of deflection terms."""
+        return np.array([self.deflection_rad if term.kind == "compliance" else self.transmission_rad for term in terms])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +79,12 @@ class Problem:
     """(S,) standard uncertainty of the certified radius."""
     lengths: tuple[LengthConstraint, ...] = ()
     priors: Priors = field(default_factory=Priors)
+    terms: tuple[RobotTerm, ...] = ()
+    """Deflection terms of the arm, K of them."""
+    load: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    """(m, n, K) of the terms."""
+    estimate_terms: bool = False
+    """Whether the terms are unknowns of the solve; else they stay zero and are only considered in the covariance."""
     along_sight: bool = True
     """Whether residuals run along the line of sight from the camera's origin (area cameras)."""
 
@@ -87,7 +102,7 @@ class Problem:
     def layout(self) -> Layout:
         """Where each unknown sits."""
         n_links = 0 if self.joints_rad is None else self.joints_rad.shape[1]
-        return Layout(n_links, len(self.camera_error.axis), len(self.radius_mm))
+        return Layout(n_links, len(self.camera_error.axis), len(self.terms), len(self.radius_mm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +111,7 @@ class Layout:
 
     n_links: int
     n_camera: int
+    n_terms: int
     n_spheres: int
 
     @property
@@ -114,9 +130,14 @@ class Layout:
         return slice(self.hand_eye.stop, self.hand_eye.stop + self.n_camera)
 
     @property
+    def terms(self) -> slice:
+        """Deflection terms of the arm."""
+        return slice(self.camera.stop, self.camera.stop + self.n_terms)
+
+    @property
     def radius_offset(self) -> slice:
         """The shared optical radius offset."""
-        return slice(self.camera.stop, self.camera.stop + 1)
+        return slice(self.terms.stop, self.terms.stop + 1)
 
     @property
     def sphere_radius(self) -> slice:
@@ -135,8 +156,8 @@ class Layout:
 
     @property
     def n_geometric(self) -> int:
-        """Robot, hand-eye and camera: what rank and n_parameters count."""
-        return int(self.camera.stop)
+        """Robot, hand-eye and camera with the arm's deflection: what moves a measured point."""
+        return int(self.terms.stop)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +169,8 @@ class State:
     flange_from_camera: FloatArray
     camera_mm: FloatArray
     """(k,)."""
+    terms_rad: FloatArray
+    """(K,) coefficients of the deflection terms."""
     radius_offset_mm: float
     sphere_radius_deviation_mm: FloatArray
     """(S,)."""
@@ -162,6 +185,7 @@ class State:
             link_twists=self.link_twists + step[layout.links].reshape(-1, 6),
             flange_from_camera=se3.exp(step[layout.hand_eye]) @ self.flange_from_camera,
             camera_mm=self.camera_mm + step[layout.camera],
+            terms_rad=self.terms_rad + step[layout.terms],
             radius_offset_mm=self.radius_offset_mm + float(step[layout.radius_offset][0]),
             sphere_radius_deviation_mm=self.sphere_radius_deviation_mm + step[layout.sphere_radius],
             centres_in_base_mm=self.centres_in_base_mm + step[layout.centres].reshape(-1, 3),
@@ -185,17 +209,18 @@ class Geometry:
     """(m, 3, 6): displacement in camera axes per nuisance twist."""
 
 
-def corrected_chain(problem: Problem, link_twists: FloatArray) -> FloatArray:
+def corrected_chain(problem: Problem, state: State) -> FloatArray:
     """`base_from_link_i` (m, n + 1, 4, 4) of every shot; a chain of one frame for pose-only data."""
     if problem.model is None or problem.joints_rad is None:
         return problem.base_from_flange[:, None]
-    return mdh.chain(problem.model, problem.joints_rad, link_twists)
+    deflection = problem.load @ state.terms_rad if state.terms_rad.any() else None
+    return mdh.chain(problem.model, problem.joints_rad, state.link_twists, deflection)
 
 
 def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None = None) -> Geometry:
     """Camera poses, expected centres and Jacobian columns of all shots at a state."""
     layout = problem.layout
-    frames = corrected_chain(problem, state.link_twists) if frames is None else frames
+    frames = corrected_chain(problem, state) if frames is None else frames
     base_from_flange = frames[:, -1]
     base_from_camera = base_from_flange @ state.flange_from_camera
     centre = state.centres_in_base_mm[problem.sphere]
@@ -207,6 +232,9 @@ def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None
     motion = np.zeros((problem.n_shots, 3, layout.size))
     if problem.model is not None and problem.joints_rad is not None:
         motion[:, :, layout.links] = link_columns(problem.model, problem.joints_rad, frames, state.link_twists, moving_point)
+        if problem.terms:
+            steps = mdh.link_transforms(problem.model, problem.joints_rad)
+            motion[:, :, layout.terms] = term_columns(problem.model, steps, frames, problem.load, moving_point)
     motion[:, :, layout.hand_eye] = twist_columns(base_from_flange, moving_point)
     rows = np.arange(problem.n_shots)
     for axis in range(3):

@@ -76,6 +76,8 @@ def make_result(
         method=method,
         model=problem.model if has_joints else None,
         link_twists=state.link_twists,
+        terms=problem.terms,
+        terms_rad=state.terms_rad,
         flange_from_camera=state.flange_from_camera,
         camera_error=problem.camera_error,
         camera_mm=state.camera_mm,
@@ -86,7 +88,7 @@ def make_result(
         datum=datum,
         seen_joints_rad=None if problem.joints_rad is None else np.array([problem.joints_rad.min(axis=0), problem.joints_rad.max(axis=0)]),
         noise=solution.noise,
-        parameter_names=parameter_names(problem.layout, names),
+        parameter_names=parameter_names(problem.layout, problem.terms, names),
         covariance=covariance,
         statistics=Statistics(
             n_shots=n_shots,

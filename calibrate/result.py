@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike
 
 from acquire.cell import Limits
 from calibrate.camera_error import CameraError, correction_in_camera_mm
-from calibrate.datum import Datum, datum_jacobian, link_columns, twist_columns
+from calibrate.datum import Datum, datum_jacobian, link_columns, term_columns, twist_columns
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
+from calibrate.robot_terms import RobotTerm, deflection_rad, load_basis
 from drivers.errors import SettingsError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
@@ -81,6 +82,10 @@ class Calibration:
     """Nominal robot, or None for a pose-only calibration."""
     link_twists: FloatArray
     """(n, 6)."""
+    terms: tuple[RobotTerm, ...]
+    """Deflection terms of the arm, K of them."""
+    terms_rad: FloatArray
+    """(K,) their coefficients; zero where they are only considered in the covariance."""
     flange_from_camera: FloatArray
     camera_error: CameraError
     camera_mm: FloatArray
@@ -132,7 +137,13 @@ class Calibration:
         q = np.asarray(joints_rad, dtype=np.float64)
         if q.shape[-1:] != (self.model.n_joints,) or not np.isfinite(q).all():
             raise SettingsError(f"joints_rad must be finite, of shape (..., {self.model.n_joints}), not {q.shape}", remedy="Pass axis angles in rad.")
-        return self.datum.base_from_solver @ mdh.base_from_flange(self.model, q, self.link_twists)
+        return self.datum.base_from_solver @ self._chain(self.model, q)[..., -1, :, :]
+
+    def base_from_links(self, joints_rad: ArrayLike) -> FloatArray:
+        """Corrected frames of the base and every link (..., n + 1, 4, 4), the flange last; raises as `base_from_flange`."""
+        if self.model is None:
+            raise SettingsError("this calibration holds no robot model: it was made from flange poses", remedy="Use the reported flange pose.")
+        return self.datum.base_from_solver @ self._chain(self.model, np.asarray(joints_rad, dtype=np.float64))
 
     def corrected_points_in_camera_mm(self, points_in_camera_mm: ArrayLike) -> FloatArray:
         """Points (n, 3) with the camera's error taken out, still in the camera frame; NaN rows stay NaN."""
@@ -182,7 +193,7 @@ class Calibration:
     def point_jacobian(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
     ) -> FloatArray:
-        """(n, 3, p) motion of points in the stated base per parameter of robot, hand-eye and camera (the first p)."""
+        """(n, 3, p) motion of points in the stated base per parameter of robot, hand-eye, camera and deflection (the first p)."""
         points = _points(points_in_camera_mm)
         flange = np.broadcast_to(self._solver_flange(joints_rad, base_from_flange, len(points)), (len(points), 4, 4))
         base_from_camera = flange @ self.flange_from_camera
@@ -190,13 +201,16 @@ class Calibration:
         blocks = []
         if self.model is not None:
             q = np.broadcast_to(np.asarray(joints_rad, dtype=np.float64), (len(points), self.model.n_joints))
-            frames = mdh.chain(self.model, q, self.link_twists)
+            frames = self._chain(self.model, q)
             moved = link_columns(self.model, q, frames, self.link_twists, in_solver_base)
             rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
             blocks.append(moved + rigid @ datum_jacobian(self.datum, self.model, self.link_twists))
         blocks.append(twist_columns(flange, in_solver_base))
         basis = self.camera_error.basis(points)
         blocks.append(base_from_camera[:, :3, :3][:, :, self.camera_error.axis] * basis[:, None, :])
+        if self.model is not None and self.terms:
+            steps = mdh.link_transforms(self.model, q)
+            blocks.append(term_columns(self.model, steps, frames, load_basis(self.terms, self.model, q), in_solver_base))
         return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
 
     def to_json_dict(self) -> dict[str, object]:
@@ -245,7 +259,10 @@ class Calibration:
             raise SettingsError(
                 f"joints_rad of shape {q.shape} does not fit {n_points} points of this robot, or is not finite", remedy=self._wanted()
             )
-        return mdh.base_from_flange(self.model, q, self.link_twists)
+        return self._chain(self.model, q)[..., -1, :, :]
+
+    def _chain(self, model: RobotModel, q: FloatArray) -> FloatArray:
+        return mdh.chain(model, q, self.link_twists, deflection_rad(self.terms, self.terms_rad, model, q))
 
     def _given_pose(self, base_from_flange: ArrayLike) -> FloatArray:
         pose = np.asarray(base_from_flange, dtype=np.float64)

@@ -17,6 +17,7 @@ from calibrate.camera_error import camera_error_from_settings
 from calibrate.datum import Datum
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
+from calibrate.robot_terms import RobotTerm
 from drivers.errors import FileError
 from drivers.files.disk import write_text_atomic
 from drivers.files.yaml import dump_yaml, load_yaml
@@ -53,7 +54,9 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "identity": dict(c.identity),
         "robot_model": None if c.model is None else robot_model_data(c.model),
         "link_twists": c.link_twists,
-        "robot_terms": {},
+        "robot_terms": [
+            {"kind": t.kind, "axis": t.axis + 1, "order": t.order, "coefficient_rad": float(value)} for t, value in zip(c.terms, c.terms_rad, strict=True)
+        ],
         "flange_from_camera": c.flange_from_camera,
         "camera_error": {**c.camera_error.settings(), "coefficients_mm": c.camera_mm, "seen_volume_mm": c.camera_seen_volume_mm},
         "radius_offset_mm": c.radius_offset_mm,
@@ -125,6 +128,8 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         method=str(data["method"]),
         model=None if data["robot_model"] is None else robot_model_from_data(data["robot_model"], file=file),
         link_twists=_array(data["link_twists"]).reshape(-1, 6),
+        terms=tuple(_term(_mapping(t)) for t in _sequence(data["robot_terms"])),
+        terms_rad=np.array([float(_array(_mapping(t)["coefficient_rad"])) for t in _sequence(data["robot_terms"])]),
         flange_from_camera=_rigid(data["flange_from_camera"], file, "flange_from_camera"),
         camera_error=camera_error_from_settings(model_settings, file=file),
         camera_mm=_array(camera["coefficients_mm"]),
@@ -149,6 +154,14 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         created_utc=str(data["created_utc"]),
         software=str(data["software"]),
     )
+
+
+def _term(data: Mapping[str, object]) -> RobotTerm:
+    match data["kind"]:
+        case "compliance" | "sine" | "cosine" as kind:
+            return RobotTerm(kind, int(str(data["axis"])) - 1, int(str(data["order"])))
+        case other:
+            raise ValueError(f"unknown robot term {other!r}")
 
 
 def _shot_data(shot: ShotResult) -> dict[str, object]:

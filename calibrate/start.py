@@ -71,6 +71,7 @@ def initial_state(problem: Problem, flange_from_camera: FloatArray, centres_in_b
         link_twists=np.zeros((layout.n_links, 6)),
         flange_from_camera=flange_from_camera,
         camera_mm=np.zeros(layout.n_camera),
+        terms_rad=np.zeros(layout.n_terms),
         radius_offset_mm=0.0,
         sphere_radius_deviation_mm=np.zeros(layout.n_spheres),
         centres_in_base_mm=centres_in_base_mm,

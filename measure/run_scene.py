@@ -148,7 +148,7 @@ def _step(
 def _link_frames(calibration: Calibration, pose: dict[str, FloatArray]) -> FloatArray:
     if calibration.model is None:
         return np.asarray(calibration.datum.base_from_solver @ pose["base_from_flange"])[None]
-    return np.asarray(calibration.datum.base_from_solver @ mdh.chain(calibration.model, pose["joints_rad"], calibration.link_twists))
+    return calibration.base_from_links(pose["joints_rad"])
 
 
 def _marks_of_all(calibration: Calibration, groups: Sequence[_Shots]) -> Iterator[SphereMark]:

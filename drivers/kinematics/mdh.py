@@ -78,9 +78,11 @@ def joints_from_link_angles_rad(model: RobotModel, theta_rad: ArrayLike) -> Floa
     return np.asarray((theta - model.theta_offset_rad) @ np.linalg.inv(model.coupling).T)
 
 
-def link_transforms(model: RobotModel, joints_rad: ArrayLike) -> FloatArray:
-    """`link_{i-1}_from_link_i` of every axis, shape (..., n, 4, 4), for q (..., n)."""
+def link_transforms(model: RobotModel, joints_rad: ArrayLike, deflection_rad: ArrayLike | None = None) -> FloatArray:
+    """`link_{i-1}_from_link_i` of every axis, shape (..., n, 4, 4), for q (..., n) and angles (..., n) that the links yield by."""
     theta = link_angles_rad(model, joints_rad)
+    if deflection_rad is not None:
+        theta = theta + np.asarray(deflection_rad, dtype=np.float64)
     sin_t, cos_t = np.sin(theta), np.cos(theta)
     sin_a, cos_a = np.sin(model.alpha_rad), np.cos(model.alpha_rad)
     result = np.zeros((*theta.shape, 4, 4))
@@ -93,12 +95,12 @@ def link_transforms(model: RobotModel, joints_rad: ArrayLike) -> FloatArray:
     return result
 
 
-def chain(model: RobotModel, joints_rad: ArrayLike, link_twists: ArrayLike | None = None) -> FloatArray:
+def chain(model: RobotModel, joints_rad: ArrayLike, link_twists: ArrayLike | None = None, deflection_rad: ArrayLike | None = None) -> FloatArray:
     """`base_from_link_i` for i = 0..n, shape (..., n + 1, 4, 4), for q (..., n) and link twists (n, 6) or none.
 
     Link i includes its own twist: the last entry is `base_from_flange`.
     """
-    steps = link_transforms(model, joints_rad)
+    steps = link_transforms(model, joints_rad, deflection_rad)
     if link_twists is not None:
         steps = steps @ se3.exp(link_twists)
     frames = [se3.identity(*steps.shape[:-3])]
@@ -107,9 +109,11 @@ def chain(model: RobotModel, joints_rad: ArrayLike, link_twists: ArrayLike | Non
     return np.stack(frames, axis=-3)
 
 
-def base_from_flange(model: RobotModel, joints_rad: ArrayLike, link_twists: ArrayLike | None = None) -> FloatArray:
-    """Forward kinematics (..., 4, 4) for q (..., n) and link twists (n, 6) or none."""
-    return chain(model, joints_rad, link_twists)[..., -1, :, :]
+def base_from_flange(
+    model: RobotModel, joints_rad: ArrayLike, link_twists: ArrayLike | None = None, deflection_rad: ArrayLike | None = None
+) -> FloatArray:
+    """Forward kinematics (..., 4, 4) for q (..., n), link twists (n, 6) or none, and deflections (..., n) or none."""
+    return chain(model, joints_rad, link_twists, deflection_rad)[..., -1, :, :]
 
 
 def within_limits(model: RobotModel, joints_rad: ArrayLike, margin_rad: float = 0.0) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

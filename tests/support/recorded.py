@@ -138,6 +138,8 @@ def nominal_calibration(cell: Cell, sessions: Sequence[Session]) -> Calibration:
         method="clouds",
         model=model,
         link_twists=np.zeros((6, 6)),
+        terms=(),
+        terms_rad=np.zeros(0),
         flange_from_camera=cell.flange_from_camera,
         camera_error=PillowError(n_terms=1),
         camera_mm=np.array([0.05]),

@@ -113,6 +113,9 @@ def observed(
     points = observe_sphere(volume.simulated, joints, sphere, n_points, rng, noise=noise)
     nominal = mdh.base_from_flange(volume.model, joints)
     mean = points.mean(axis=0)
+    centre, _ = fit_fixed_radius(points, DIAMETER_MM / 2, mean * (1 + 0.6 * DIAMETER_MM / 2 / np.linalg.norm(mean)))
+    cosine = -np.einsum("ni,ni->n", points - centre, points) / np.linalg.norm(points - centre, axis=1) / np.linalg.norm(points, axis=1)
+    points = points[cosine > 0.5]  # what sphere finding keeps
     return SphereShot(
         session="s",
         index=index,
@@ -122,7 +125,7 @@ def observed(
         base_from_flange=nominal,
         points_in_camera_mm=points,
         radius_mm=DIAMETER_MM / 2,
-        centre_in_camera_mm=mean * (1 + 0.6 * DIAMETER_MM / 2 / np.linalg.norm(mean)),
+        centre_in_camera_mm=centre,
     )
 
 
