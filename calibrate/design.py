@@ -7,7 +7,6 @@ has them, certified lengths as rows. What no model describes is carried through 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ from calibrate.design_shots import IntArray, Scene, actual_covariance, layout_of
 from drivers.errors import SettingsError
 from drivers.kinematics.se3 import FloatArray
 
-_SWEEPS = 2
+SWEEPS = 2
 _FEWEST_SHARE = 0.5
 """Every sphere gets at least this part of an even share."""
 
@@ -37,13 +36,13 @@ class Predicted:
     centre_rms_mm: float | None
     """Of the centre of one view about the mean of many, with its own noise; None for line profiles."""
 
-    def to_json_dict(self) -> Mapping[str, object]:
+    def to_json_dict(self) -> dict[str, object]:
         """For plan files and `--json`."""
         return {
-            "centre_rms_mm": self.centre_rms_mm,
-            "length_rms_mm": self.length_rms_mm,
-            "length_noise_rms_mm": self.length_noise_rms_mm,
-            "length_mismatch_rms_mm": self.length_mismatch_rms_mm,
+            "centre_rms_mm": None if self.centre_rms_mm is None else round(self.centre_rms_mm, 5),
+            "length_rms_mm": round(self.length_rms_mm, 5),
+            "length_noise_rms_mm": round(self.length_noise_rms_mm, 5),
+            "length_mismatch_rms_mm": round(self.length_mismatch_rms_mm, 5),
         }
 
 
@@ -103,7 +102,9 @@ def predicted_of_shots(scene: Scene, aim: Aim, joints_rad: FloatArray, sphere: I
     return predicted_of(information_of(scene, joints_rad, sphere), aim, len(joints_rad))
 
 
-def choose_shots(scene: Scene, aim: Aim, joints_rad: FloatArray, sphere: IntArray, n: int, *, already: Information | None = None) -> Design:
+def choose_shots(
+    scene: Scene, aim: Aim, joints_rad: FloatArray, sphere: IntArray, n: int, *, already: Information | None = None, sweeps: int = SWEEPS
+) -> Design:
     """The n of some candidates that leave the least error of lengths: greedily, then by exchanges.
 
     The same candidates in another order make the same choice.
@@ -115,6 +116,7 @@ def choose_shots(scene: Scene, aim: Aim, joints_rad: FloatArray, sphere: IntArra
         sphere: (m,) index of the sphere that each looks at.
         n: how many to choose.
         already: shots that are taken, or none.
+        sweeps: rounds of exchanges at most.
 
     Raises:
         SettingsError: fewer candidates than wanted.
@@ -125,7 +127,7 @@ def choose_shots(scene: Scene, aim: Aim, joints_rad: FloatArray, sphere: IntArra
     pool = Pool(shot_rows(scene, joints_rad[own_order], sphere[own_order]), sphere[own_order])
     fewest = min(max(3, int(_FEWEST_SHARE * n / len(scene.radius_mm))), n // len(scene.radius_mm))
     chosen, information = greedy(already or information_before(scene), aim.lengths, pool, n, fewest)
-    chosen, information = exchanged(information, aim.lengths, pool, chosen, fewest, _SWEEPS)
+    chosen, information = exchanged(information, aim.lengths, pool, chosen, fewest, sweeps)
     return Design(own_order[chosen], information, predicted_of(information, aim, n))
 
 

@@ -122,13 +122,22 @@ def work_box_mm(cell: Cell, centres_in_base_mm: FloatArray) -> FloatArray:
     return np.array([(lower + upper) / 2 - half, (lower + upper) / 2 + half])
 
 
-def aim_of_cell(cell: Cell, scene: Scene, rng: np.random.Generator, *, n_places: int = N_PLACES, views_per_place: int = VIEWS_PER_PLACE) -> Aim:
+def aim_of_cell(
+    cell: Cell,
+    scene: Scene,
+    rng: np.random.Generator,
+    *,
+    box_in_base_mm: FloatArray | None = None,
+    n_places: int = N_PLACES,
+    views_per_place: int = VIEWS_PER_PLACE,
+) -> Aim:
     """Lengths between random places of the work volume, each seen from feasible views of all arm branches.
 
     Args:
         cell: whose work volume and camera count.
         scene: robot, camera and spheres.
         rng: seeded by the caller.
+        box_in_base_mm: (2, 3) where accuracy matters; `work_box_mm` if None.
         n_places: places that spheres would be measured at.
         views_per_place: views of each.
 
@@ -136,8 +145,9 @@ def aim_of_cell(cell: Cell, scene: Scene, rng: np.random.Generator, *, n_places:
         DataError: fewer than two places are reachable.
         SettingsError: the cell does not tell what the camera sees.
     """
-    box = work_box_mm(cell, scene.centres_in_base_mm)
-    places = box[0] + rng.random((n_places, 3)) * (box[1] - box[0])
+    box = work_box_mm(cell, scene.centres_in_base_mm) if box_in_base_mm is None else box_in_base_mm
+    # towards the faces (arcsine law): long lengths count, and errors are largest where the volume ends
+    places = box[0] + np.sin(np.pi / 2 * rng.random((n_places, 3))) ** 2 * (box[1] - box[0])
     view = camera_view(cell.camera)
     views = [feasible_views(scene, view, place, views_per_place, rng) for place in places]
     return aim_at(scene, places, views)

@@ -18,6 +18,7 @@ from measure.cli_demo import demo
 from measure.cli_export import export
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
+from measure.cli_predict import predict
 from measure.cli_report import report, show
 from measure.cli_run import run_app
 from measure.cli_solve import calibrate, centres
@@ -39,6 +40,7 @@ app.command("demo")(demo)
 app.add_typer(new, name="new")
 app.command("doctor")(doctor)
 app.command("plan")(plan)
+app.command("predict")(predict)
 app.command("capture")(capture)
 app.command("centres")(centres)
 app.command("calibrate")(calibrate)

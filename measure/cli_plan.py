@@ -41,7 +41,7 @@ def plan(
     debug: Debug = False,
     quiet: Quiet = False,
 ) -> None:
-    """Plan feasible, well-spread poses and write them as a plan that may be edited."""
+    """Plan feasible poses (for a calibration those that tell most) and write them as a plan that may be edited."""
     with command(as_json, debug, quiet) as run:
         import numpy as np
 
@@ -64,3 +64,7 @@ def _tell(console: Console, result: PlanResult, out: Path) -> None:
     rows = [[f"rejected: {reason}", count] for reason, count in sorted(result.rejected.items())]
     console.table("", ["candidates", "views"], [["drawn", result.n_candidates], *rows, ["feasible", result.n_feasible]])
     console.say(f"{len(result.plan.poses)} poses in {out}")
+    length_mm, centre_mm = (result.plan.predicted.get(key) for key in ("length_rms_mm", "centre_rms_mm"))
+    if length_mm is not None:
+        centre = "" if centre_mm is None else f", centre of one view {centre_mm:.3f} mm"
+        console.say(f"expected of a calibration from them, one sigma: lengths over the work volume {length_mm:.3f} mm{centre}")

@@ -1,4 +1,8 @@
-"""From a cell to a plan: feasible views of each sphere or of a region, a well-spread choice, an order with little travel."""
+"""From a cell to a plan: feasible views of each sphere or of a region, a choice among them, an order with little travel.
+
+Calibration poses are those that tell most about lengths in the work volume (`calibrate.design`); verification poses are
+spread evenly, so that they judge and do not repeat what the design found convenient.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,9 @@ Purpose: TypeAlias = Literal["calibration", "verification", "workpiece"]
 
 CANDIDATES_PER_POSE = 12
 FEWEST_CANDIDATES = 200
+MOST_DESIGNED_FROM = 1500
+"""Candidates that the design looks at: more make it slower and hardly better."""
+_NOTE = "one sigma, first order; unmodelled physics of usual size is included, a damaged robot or camera is not"
 
 # Plans for different purposes are drawn from different streams: a verification that repeats the poses of the
 # calibration would prove nothing.
@@ -52,7 +59,7 @@ class PlanResult:
     rejected: Mapping[str, int] = field(default_factory=dict)
 
     def to_json_dict(self) -> Mapping[str, object]:
-        """What `spherecal plan --json` prints; nothing is predicted here, so the predictions are null."""
+        """What `spherecal plan --json` prints; predictions are null but for calibrations."""
         return {
             "n_candidates": self.n_candidates,
             "n_feasible": self.n_feasible,
@@ -70,7 +77,7 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
         DataError: too few poses are feasible.
         FileError: the robot model is missing or broken.
     """
-    model, flange_from_camera = _needed(cell)
+    model, flange_from_camera = needed_of(cell)
     rng = np.random.default_rng([settings.seed, _STREAM[settings.purpose]])
     view = camera_view(cell.camera)
     pools: list[tuple[str | None, CandidatePool]] = []
@@ -79,11 +86,37 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
     else:
         spheres = _spheres(cell, settings.spheres)
         for name, n in zip(spheres, _shared_out(settings.n_poses, len(spheres)), strict=True):
-            pools.append((name, _sphere_pool(cell, name, n, model, flange_from_camera, view, rng)))
+            pool = _sphere_pool(cell, name, n, model, flange_from_camera, view, rng)
+            pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng))))
+    if settings.purpose == "calibration":
+        return _result(cell, settings.purpose, *_designed(cell, model, pools, settings.n_poses, rng))
     return _result(cell, settings.purpose, pools)
 
 
-def _result(cell: Cell, purpose: Purpose, pools: Sequence[tuple[str | None, CandidatePool]]) -> PlanResult:
+def _designed(
+    cell: Cell, model: RobotModel, pools: Sequence[tuple[str | None, CandidatePool]], n: int, rng: np.random.Generator
+) -> tuple[list[tuple[str | None, CandidatePool]], Mapping[str, object]]:
+    """The pools with only the poses that tell most, and what these will make of the work volume."""
+    from threadpoolctl import threadpool_limits
+
+    from calibrate.design import choose_shots
+    from calibrate.design_cell import aim_of_cell, scene_of_cell
+
+    most = max(MOST_DESIGNED_FROM, CANDIDATES_PER_POSE * n) // len(pools)
+    fewer = [(name, pool.take(np.sort(rng.permutation(len(pool.view))[:most]))) for name, pool in pools]
+    sphere = np.repeat(np.arange(len(fewer)), [len(pool.view) for _, pool in fewer])
+    joints = np.concatenate([pool.joints_rad for _, pool in fewer])
+    with threadpool_limits(limits=1, user_api="blas"):
+        scene = scene_of_cell(cell, model, [str(name) for name, _ in fewer])
+        design = choose_shots(scene, aim_of_cell(cell, scene, rng), joints, sphere, n)
+    first = np.concatenate([[0], np.cumsum([len(pool.view) for _, pool in fewer])])
+    chosen = [(name, pool.take(np.sort(design.rows[sphere[design.rows] == i]) - first[i])) for i, (name, pool) in enumerate(fewer)]
+    return chosen, design.predicted.to_json_dict() | {"note": _NOTE}
+
+
+def _result(
+    cell: Cell, purpose: Purpose, pools: Sequence[tuple[str | None, CandidatePool]], predicted: Mapping[str, object] | None = None
+) -> PlanResult:
     names = [name for name, pool in pools for _ in pool.view]
     joints = np.concatenate([pool.joints_rad for _, pool in pools])
     order = order_by_travel(joints)
@@ -92,11 +125,12 @@ def _result(cell: Cell, purpose: Purpose, pools: Sequence[tuple[str | None, Cand
     for _, pool in pools:
         rejected.update(pool.rejected)
     n_candidates = sum(pool.n_candidates for _, pool in pools)
-    plan = Plan(cell.sha256, purpose, poses)
+    plan = Plan(cell.sha256, purpose, poses, dict(predicted or {}))
     return PlanResult(plan, n_candidates, n_candidates - rejected.total(), dict(rejected))
 
 
-def _needed(cell: Cell) -> tuple[RobotModel, FloatArray]:
+def needed_of(cell: Cell) -> tuple[RobotModel, FloatArray]:
+    """Robot model and hand-eye guess of a cell; SettingsError where it lacks one."""
     model = robot_model_of(cell)
     if model is None:
         raise SettingsError("poses cannot be planned without a robot model", file=cell.path, where="robot.model", remedy="Name a model.")
@@ -149,7 +183,7 @@ def _sphere_pool(
             where=f"spheres.{name}",
             remedy="Move the sphere to the middle of the robot's reach, or ask for fewer poses.",
         )
-    return pool.take(choose_spread(pool, n, rng))
+    return pool
 
 
 def _workpiece_pool(

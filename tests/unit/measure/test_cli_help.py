@@ -26,7 +26,7 @@ print("\\n".join(["loaded:", *sorted(sys.modules)]), file=sys.stderr)
 sys.exit(code)
 """
 
-VERBS = ["demo", "new", "doctor", "plan", "capture", "centres", "calibrate", "verify", "stitch", "report", "show", "study"]
+VERBS = ["demo", "new", "doctor", "plan", "predict", "capture", "centres", "calibrate", "verify", "stitch", "report", "show", "study"]
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["calibrate", "--help"], ["--version"]])

@@ -34,9 +34,11 @@ def test_plan_writes_a_plan_that_loads_and_tells_the_contracts_keys(cell_path: P
     assert run_app(app, ["plan", str(cell_path), "-n", "13", "-o", str(out), "--json"]) == 0
     told = json.loads(capfd.readouterr().out)
     assert told["n_candidates"] == told["n_feasible"] + sum(told["rejected"].values())
-    assert told["predicted"] == {"centre_rms_mm": None, "length_rms_mm": None}
     cell = load_cell(cell_path)
     plan = load_plan(out, cell, robot_model_of(cell))
+    assert told["predicted"] == plan.predicted
+    assert 0.001 < told["predicted"]["length_rms_mm"] < 1
+    assert 0.03 < told["predicted"]["centre_rms_mm"] < 1
     assert len(plan.poses) == len(told["poses"]) == 13
     assert plan.purpose == "calibration"
     assert {pose.sphere for pose in plan.poses} == set(cell.spheres)
@@ -63,6 +65,19 @@ def test_the_seed_makes_the_plan_and_purposes_differ(cell: Cell) -> None:
     assert joints(PlanSettings(n_poses=12)) == first
     assert not set(joints(PlanSettings(n_poses=12, seed=1))) & set(first)
     assert not set(joints(PlanSettings("verification", n_poses=12))) & set(first)
+
+
+def test_a_verification_is_spread_and_predicts_nothing(cell: Cell) -> None:
+    result = make_plan(cell, PlanSettings("verification", n_poses=12))
+    assert result.to_json_dict()["predicted"] == {"centre_rms_mm": None, "length_rms_mm": None}
+
+
+def test_a_calibration_plan_uses_several_branches_and_shares_its_poses(cell: Cell) -> None:
+    poses = make_plan(cell, PlanSettings(n_poses=40, spheres=("A", "B", "C", "D"))).plan.poses
+    counts = [sum(pose.sphere == name for pose in poses) for name in "ABCD"]
+    assert sum(counts) == 40
+    assert min(counts) >= 5
+    assert len({bool(np.sin(pose.joints_rad[4]) > 0) for pose in poses}) == 2
 
 
 def test_a_workpiece_plan_looks_at_its_region(cell: Cell) -> None:
