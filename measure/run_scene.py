@@ -11,7 +11,7 @@ from acquire.cell import Cell
 from calibrate.observations import SphereShot
 from calibrate.result import Calibration
 from drivers.files.session import Session, read_scan
-from drivers.kinematics import mdh, se3
+from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.placing import nominal_base_from_camera, pose_of
 from measure.report_text import mm
