@@ -45,7 +45,7 @@ def volume_case(
     return Case(scene, np.concatenate(views), sphere, aim_at(scene, places, looks), places, looks)
 
 
-def random_rows(case: Case, n: int, rng: np.random.Generator) -> FloatArray:
+def random_rows(case: Case, n: int, rng: np.random.Generator) -> IntArray:
     """Rows of n candidates, shared evenly among the spheres."""
     n_spheres = len(case.scene.radius_mm)
     return np.concatenate([rng.permutation(np.flatnonzero(case.sphere == i))[: n // n_spheres] for i in range(n_spheres)])
@@ -79,7 +79,7 @@ def measured_points(problem: Problem, truth: State, unit: FloatArray, noise_mm: 
     return np.asarray(measured)
 
 
-def solved_length_errors_mm(case: Case, rows: FloatArray, rng: np.random.Generator) -> FloatArray:
+def solved_length_errors_mm(case: Case, rows: IntArray, rng: np.random.Generator) -> FloatArray:
     """Errors of the aim's lengths after a solve of chosen shots of a drawn truth; the noise model is known to the solver."""
     scene, joints, sphere = case.scene, case.joints_rad[rows], case.sphere[rows]
     expectation = scene.expectation
