@@ -88,6 +88,13 @@ class SyntheticCell:
     centre_in_base_mm: FloatArray
     radius_mm: float = 19.05
     reads_large_mm: float = 0.0
+    yields_rad: Callable[[FloatArray], FloatArray] | None = None
+    """Change (n,) of the true axis angles at reported ones (n,): gravity, gears."""
+
+    def true_base_from_flange(self, joints_rad: FloatArray) -> FloatArray:
+        """(4, 4) where the flange truly is, noise apart."""
+        yielded = joints_rad if self.yields_rad is None else joints_rad + self.yields_rad(joints_rad)
+        return mdh.base_from_flange(self.true, yielded)
 
 
 @dataclass(frozen=True)
@@ -134,8 +141,7 @@ def draw_shot(
         if joints is not None:
             break
     noise = np.concatenate([rng.normal(0, pose_noise[0], 3), rng.normal(0, pose_noise[1], 3)])
-    flange = mdh.base_from_flange(cell.true, joints)
-    flange = flange @ se3.exp(noise)
+    flange = cell.true_base_from_flange(joints) @ se3.exp(noise)
     base_from_camera = flange @ cell.flange_from_camera
     centre = se3.apply(se3.inverse(base_from_camera), cell.centre_in_base_mm)
     points = sample_cap(centre, cell.radius_mm + cell.reads_large_mm, n_points, rng)

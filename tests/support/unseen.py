@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate import Calibration
+from calibrate.problem import Priors
+from calibrate.robot_terms import arm_terms, load_basis
 from calibrate.solve import CalibrationSettings, calibrate
 from drivers.files.session import read_session
 from drivers.kinematics import se3
@@ -63,7 +65,10 @@ def unseen_length(
 
 
 def cell_of_the_solvers_own_kind(rng: np.random.Generator) -> SyntheticCell:
-    """Random MDH errors, the pillow, a sphere that reads a little large: nothing that the solver has no unknown for."""
+    """Random MDH errors, the pillow, a sphere that reads a little large, an arm that yields as its priors say.
+
+    Nothing that the solver has no unknown for, or does not carry in its covariance.
+    """
     cell = paper_cell()
     nominal = cell.nominal
     true = replace(
@@ -73,7 +78,14 @@ def cell_of_the_solvers_own_kind(rng: np.random.Generator) -> SyntheticCell:
         alpha_rad=nominal.alpha_rad + rng.normal(0, 5e-4, 6),
         theta_offset_rad=nominal.theta_offset_rad + rng.normal(0, 5e-4, 6),
     )
-    return replace(cell, true=true, reads_large_mm=float(rng.normal(0, 0.03)))
+    terms = arm_terms(nominal)
+    coefficients = rng.normal(0, Priors().term_sigma_rad(terms))
+
+    def yields_rad(joints_rad: FloatArray) -> FloatArray:
+        # of the link angles, which are the axis angles here: this robot has no coupling
+        return np.asarray(load_basis(terms, nominal, joints_rad) @ coefficients)
+
+    return replace(cell, true=true, reads_large_mm=float(rng.normal(0, 0.03)), yields_rad=yields_rad)
 
 
 def random_unseen_lengths(seed: int, folder: Path, *, n_shots: int, n_points: int, n_lengths: int) -> list[UnseenLength]:
