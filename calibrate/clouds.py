@@ -18,6 +18,7 @@ POINT_CUTOFF_SIGMAS = 5.0
 """Geman-McClure cutoff in standard deviations: a clean point keeps 92 % of its weight on average."""
 _LAST_ESTIMATE = 7
 """Passes in which the noise model is estimated anew; later ones hold it, so that the descent can end."""
+_FIRST_SWEEPS = 4
 _STEP_TOLERANCE_MM = 1e-8
 _STALL_TOLERANCE_MM = 1e-5
 _PATIENCE, _LAST_TOLERANCE_MM = 25, 1e-3
@@ -89,7 +90,7 @@ def solve_clouds(
         moments, counts = shot_moments(problem, state, geometry, cutoff)
         linearised = normal.linearise(problem, state, geometry, moments, noise.point_weight(n_points))
         if estimating and passes > 1:
-            noise = estimate_pose_noise(linearised, noise)
+            noise = estimate_pose_noise(linearised, noise, sweeps=_FIRST_SWEEPS if passes == 2 else 1)
         reduced = normal.reduce(linearised, noise.pose_precision)
         if settled:
             rms = np.sqrt(counts[:, 1] / counts[:, 2])

@@ -55,7 +55,8 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "robot_model": None if c.model is None else robot_model_data(c.model),
         "link_twists": c.link_twists,
         "robot_terms": [
-            {"kind": t.kind, "axis": t.axis + 1, "order": t.order, "coefficient_rad": float(value)} for t, value in zip(c.terms, c.terms_rad, strict=True)
+            {"kind": t.kind, "axis": t.axis + 1, "order": t.order, "coefficient_rad": float(value)}
+            for t, value in zip(c.terms, c.terms_rad, strict=True)
         ],
         "flange_from_camera": c.flange_from_camera,
         "camera_error": {**c.camera_error.settings(), "coefficients_mm": c.camera_mm, "seen_volume_mm": c.camera_seen_volume_mm},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from drivers.kinematics.se3 import FloatArray
 
 _SMALLEST_MM, _SMALLEST_RAD = 1e-4, 2e-7
 _SMALLEST_POINT_MM = 1e-4
+_PROBE, _LONGEST = 0.3, 5.0
+"""Step of the probes in the logarithm of a sigma, and the longest step in probes."""
 _FREE_PER_SHOT = 3
 """What the pose noise of a shot takes out of its patches."""
 
@@ -30,22 +33,35 @@ def estimate_point_noise(patch_sums: FloatArray, noise: NoiseModel) -> NoiseMode
     return replace(noise, point_mm=float(np.sqrt(point_variance)), form_mm=float(np.sqrt(max(form_variance, 0.0))))
 
 
-def estimate_pose_noise(linearised: Linearised, start: NoiseModel) -> NoiseModel:
+def estimate_pose_noise(linearised: Linearised, start: NoiseModel, *, sweeps: int = 4) -> NoiseModel:
     """The (s_t, s_r) that make the data most likely, unknowns integrated out; never below a tenth of a micrometre.
 
-    Nelder-Mead in the logarithms: the cost is flat towards zero, where Newton steps go astray.
+    Parabolas through three points in the logarithm of one sigma after the other: the cost is flat towards zero, where
+    Newton steps go astray. A few sweeps find it; one follows it while the solve itself still moves.
     """
-    from scipy.optimize import minimize
-
     floor = np.log([_SMALLEST_MM, _SMALLEST_RAD])
+    where = np.maximum(np.log([start.pose_mm, start.pose_rad]), floor)
 
     def cost(log_sigma: FloatArray) -> float:
         sigma_mm, sigma_rad = np.exp(np.maximum(log_sigma, floor))
-        excess = float(np.maximum(floor - log_sigma, 0.0).sum())
-        return marginal_cost(linearised, replace(start, pose_mm=sigma_mm, pose_rad=sigma_rad).pose_precision) + excess
+        return marginal_cost(linearised, replace(start, pose_mm=float(sigma_mm), pose_rad=float(sigma_rad)).pose_precision)
 
-    first = np.maximum(np.log([start.pose_mm, start.pose_rad]), floor + 1.0)
-    simplex = first + np.array([[0.0, 0.0], [-0.7, 0.0], [0.0, -0.7]])
-    found = minimize(cost, first, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.02, "maxfev": 80})
-    sigma_mm, sigma_rad = np.exp(np.maximum(found.x, floor))
-    return replace(start, pose_mm=float(sigma_mm), pose_rad=float(sigma_rad))
+    here = cost(where)
+    for _ in range(sweeps):
+        for axis in range(2):
+            where, here = _parabola_step(cost, where, here, axis)
+        where = np.maximum(where, floor)
+    return replace(start, pose_mm=float(np.exp(where[0])), pose_rad=float(np.exp(where[1])))
+
+
+def _parabola_step(cost: Callable[[FloatArray], float], where: FloatArray, here: float, axis: int) -> tuple[FloatArray, float]:
+    """One coordinate's best of the three points and of the vertex of their parabola."""
+    unit = np.zeros(2)
+    unit[axis] = _PROBE
+    above, below = cost(where + unit), cost(where - unit)
+    curvature = above + below - 2 * here
+    step = 0.5 * (below - above) / curvature if curvature > 0 else np.sign(below - above) * _LONGEST
+    vertex = where + unit * float(np.clip(step, -_LONGEST, _LONGEST))
+    tried = [(here, where), (above, where + unit), (below, where - unit), (cost(vertex), vertex)]
+    best, place = min(tried, key=lambda item: item[0])
+    return place, best
