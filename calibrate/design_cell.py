@@ -14,6 +14,7 @@ from calibrate.camera_error import camera_error_models
 from calibrate.design_aim import Aim, aim_at
 from calibrate.design_shots import Expectation, IntArray, Scene
 from calibrate.problem import LengthConstraint
+from calibrate.result import Calibration
 from drivers.errors import SettingsError
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -111,6 +112,12 @@ def scene_of_cell(
         if set(length.between) <= set(known)
     ]
     return scene_of(cell, model, spheres, lengths, expectation=expectation, camera_error=camera_error)
+
+
+def expectation_of(calibration: Calibration) -> Expectation:
+    """What shots of a cell are like, from an earlier calibration of it: noise, pose noise, form error, points a shot."""
+    counts = [float(shot.n_points) for shot in calibration.shots]
+    return Expectation(noise=calibration.noise, n_points=int(np.median(counts)) if counts else Expectation().n_points)
 
 
 def work_box_mm(cell: Cell, centres_in_base_mm: FloatArray) -> FloatArray:

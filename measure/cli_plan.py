@@ -11,6 +11,7 @@ import typer
 from measure.cli_run import AsJson, Debug, Quiet, command
 
 if TYPE_CHECKING:
+    from calibrate.design_shots import Expectation
     from measure.console import Console
     from measure.planning import PlanResult, Purpose
 
@@ -36,6 +37,9 @@ def plan(
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box in the base, mm, for --for workpiece; the work volume if left out."),
     ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="An earlier calibration of this cell: its noise is expected instead of a usual one.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -51,13 +55,21 @@ def plan(
         from measure.planning import PlanSettings, make_plan
 
         box = None if region is None else np.array(region).reshape(2, 3)
-        result = make_plan(load_cell(cell), PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed))
+        settings = PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed, _expectation(calibration))
+        result = make_plan(load_cell(cell), settings)
         with replacing(out, PLAN_FORMAT) as former:
             write_plan(result.plan, out)
         if former is not None and former.exists():
             run.console.note(f"the earlier {out} was kept as {former}")
         _tell(run.console, result, out)
         run.finish({**result.to_json_dict(), "out": out})
+
+
+def _expectation(calibration: Path | None) -> Expectation | None:
+    from calibrate import Calibration
+    from calibrate.design_cell import expectation_of
+
+    return None if calibration is None else expectation_of(Calibration.load(calibration))
 
 
 def _tell(console: Console, result: PlanResult, out: Path) -> None:

@@ -20,6 +20,9 @@ def predict(
         list[str] | None, typer.Option("--spheres", help="Spheres of the cell to judge together, e.g. A,B; all of known place if left out.")
     ] = None,
     n: Annotated[list[str] | None, typer.Option("-n", help="Numbers of shots, e.g. 30,60,120 (the default).")] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="An earlier calibration of this cell: its noise is expected instead of a usual one.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -30,17 +33,20 @@ def predict(
         from threadpoolctl import threadpool_limits
 
         from acquire.cell import load_cell
+        from calibrate import Calibration
+        from calibrate.design_cell import expectation_of
         from calibrate.predict import DEFAULT_SHOTS, artefacts_of, predict_artefact, ranked
         from measure.planning import needed_of
 
         counts = sorted({_number(text) for text in _pieces(n)}) or list(DEFAULT_SHOTS)
         loaded = load_cell(cell)
         model, _ = needed_of(loaded)
+        expectation = None if calibration is None else expectation_of(Calibration.load(calibration))
         artefacts = artefacts_of(loaded, _pieces(spheres))
         found = []
         with run.console.progress("predicting") as advance, threadpool_limits(limits=1, user_api="blas"):
             for done, artefact in enumerate(artefacts, start=1):
-                found.append(predict_artefact(loaded, model, artefact, counts, seed=seed))
+                found.append(predict_artefact(loaded, model, artefact, counts, seed=seed, expectation=expectation))
                 advance(done, len(artefacts))
         predictions = ranked(found)
         _tell(run.console, predictions)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from acquire.visibility import CameraView, camera_view
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
+
+if TYPE_CHECKING:
+    from calibrate.design_shots import Expectation
 
 Purpose: TypeAlias = Literal["calibration", "verification", "workpiece"]
 
@@ -47,6 +50,8 @@ class PlanSettings:
     region_mm: FloatArray | None = None
     """(2, 3) box in the base that workpiece poses cover; the cell's work volume if None."""
     seed: int = 0
+    expectation: Expectation | None = None
+    """What shots are like, e.g. of an earlier calibration; stated defaults if None. For calibrations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,12 +94,12 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
             pool = _sphere_pool(cell, name, n, model, flange_from_camera, view, rng)
             pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng))))
     if settings.purpose == "calibration":
-        return _result(cell, settings.purpose, *_designed(cell, model, pools, settings.n_poses, rng))
+        return _result(cell, settings.purpose, *_designed(cell, model, pools, settings, rng))
     return _result(cell, settings.purpose, pools)
 
 
 def _designed(
-    cell: Cell, model: RobotModel, pools: Sequence[tuple[str | None, CandidatePool]], n: int, rng: np.random.Generator
+    cell: Cell, model: RobotModel, pools: Sequence[tuple[str | None, CandidatePool]], settings: PlanSettings, rng: np.random.Generator
 ) -> tuple[list[tuple[str | None, CandidatePool]], Mapping[str, object]]:
     """The pools with only the poses that tell most, and what these will make of the work volume."""
     from threadpoolctl import threadpool_limits
@@ -102,13 +107,13 @@ def _designed(
     from calibrate.design import choose_shots
     from calibrate.design_cell import aim_of_cell, scene_of_cell
 
-    most = max(MOST_DESIGNED_FROM, CANDIDATES_PER_POSE * n) // len(pools)
+    most = max(MOST_DESIGNED_FROM, CANDIDATES_PER_POSE * settings.n_poses) // len(pools)
     fewer = [(name, pool.take(np.sort(rng.permutation(len(pool.view))[:most]))) for name, pool in pools]
     sphere = np.repeat(np.arange(len(fewer)), [len(pool.view) for _, pool in fewer])
     joints = np.concatenate([pool.joints_rad for _, pool in fewer])
     with threadpool_limits(limits=1, user_api="blas"):
-        scene = scene_of_cell(cell, model, [str(name) for name, _ in fewer])
-        design = choose_shots(scene, aim_of_cell(cell, scene, rng), joints, sphere, n)
+        scene = scene_of_cell(cell, model, [str(name) for name, _ in fewer], expectation=settings.expectation)
+        design = choose_shots(scene, aim_of_cell(cell, scene, rng), joints, sphere, settings.n_poses)
     first = np.concatenate([[0], np.cumsum([len(pool.view) for _, pool in fewer])])
     chosen = [(name, pool.take(np.sort(design.rows[sphere[design.rows] == i]) - first[i])) for i, (name, pool) in enumerate(fewer)]
     return chosen, design.predicted.to_json_dict() | {"note": _NOTE}

@@ -208,3 +208,10 @@ def test_an_aim_needs_two_places() -> None:
     case = volume_case("bar1", per_sphere=1)
     with pytest.raises(DataError, match="fewer than two places"):
         aim_at(case.scene, case.places_in_base_mm, [case.views_rad[0], *[np.zeros((0, 6))] * 7])
+
+
+def test_less_noise_is_expected_to_leave_less(case: Case) -> None:
+    quiet = replace(case.scene, expectation=Expectation(noise=NoiseModel(point_mm=0.02, pose_mm=0.005, pose_rad=2e-5), n_points=5000))
+    few = slice(None, None, 4)
+    usual, better = (predicted_of_shots(s, case.aim, case.joints_rad[few], case.sphere[few]) for s in (case.scene, quiet))
+    assert better.length_noise_rms_mm < 0.5 * usual.length_noise_rms_mm

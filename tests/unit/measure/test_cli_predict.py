@@ -46,3 +46,9 @@ def test_the_table_names_every_artefact(cell_path: Path, capfd: pytest.CaptureFi
 def test_what_cannot_be_predicted_is_told(arguments: list[str], code: int, words: str, cell_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, ["predict", str(cell_path), *arguments]) == code
     assert words in capfd.readouterr().err
+
+
+def test_a_missing_calibration_is_told(cell_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for verb in ("predict", "plan"):
+        assert run_app(app, [verb, str(cell_path), "--calibration", str(cell_path.parent / "none.yaml")]) == 1
+        assert "none.yaml" in capfd.readouterr().err
