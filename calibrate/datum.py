@@ -1,7 +1,9 @@
 """The base frame of a calibration: a free solve moves it by tenths of a mm, so it must be said (DESIGN.md 3, *Datum*).
 
 The base is the rigid motion that brings the calibrated robot nearest to the nominal one over the poses that were used:
-four points fixed to the flange (its origin and three at the distance of the work) at every reference pose.
+four points fixed to the flange (its origin and three at the distance of the work) at every reference pose. A constant
+shift of the flange is left free in that fit: link n and the hand-eye transform are one displacement that no data can
+divide between them (METHOD.md 3), and without that freedom their priors would move the base by millimetres.
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ from drivers.kinematics.se3 import FloatArray
 ARM_MM = 400.0
 """Distance from the flange at which work is measured: how much orientation counts against position."""
 MAX_REFERENCES = 60
+_CORNERS_MM = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
+_ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +39,14 @@ def nominal_robot_datum(model: RobotModel, link_twists: FloatArray, joints_rad: 
     """Best fit of the calibrated to the nominal robot over some poses (m, n); their order does not matter."""
     ordered = joints_rad[np.lexsort(joints_rad.T)]
     references = ordered[np.unique(np.linspace(0, len(ordered) - 1, min(MAX_REFERENCES, len(ordered))).round().astype(int))]
-    solved = _points(mdh.base_from_flange(model, references, link_twists))
-    return Datum("nominal_robot", se3.fit_rigid(solved, _points(mdh.base_from_flange(model, references))), references)
+    nominal, solved = mdh.base_from_flange(model, references), mdh.base_from_flange(model, references, link_twists)
+    base_from_solver, flange_offset = np.eye(4), np.eye(4)
+    for _ in range(_ROUNDS):
+        moved = base_from_solver @ solved @ flange_offset
+        step = _fit_step(moved, (_points(nominal) - _points(moved)).reshape(-1, 1))[:, 0]
+        base_from_solver = se3.exp(step[:6]) @ base_from_solver
+        flange_offset = flange_offset @ se3.exp(step[6:])
+    return Datum("nominal_robot", base_from_solver, references)
 
 
 def controller_datum() -> Datum:
@@ -50,30 +60,46 @@ def datum_jacobian(datum: Datum, model: RobotModel | None, link_twists: FloatArr
         return np.zeros((6, link_twists.size))
     frames = mdh.chain(model, datum.reference_joints_rad, link_twists)
     points = _points(frames[:, -1]).reshape(len(frames), 4, 3)
-    jacobian = np.stack([link_columns(model, datum.reference_joints_rad, frames, link_twists, points[:, i]) for i in range(4)], axis=1)
-    flat_points, flat_jacobian = points.reshape(-1, 3), jacobian.reshape(-1, link_twists.size)
-    design = np.concatenate([np.broadcast_to(np.eye(3), (len(flat_points), 3, 3)), -se3.hat(flat_points)], axis=-1).reshape(-1, 6)
-    scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3])
-    return np.asarray(-scale[:, None] * np.linalg.lstsq(design * scale, flat_jacobian, rcond=None)[0])
+    jacobian = np.stack([link_columns(link_twists, frames, points[:, i]) for i in range(4)], axis=1)
+    return -_fit_step(frames[:, -1], jacobian.reshape(-1, link_twists.size))[:6]
 
 
-def term_columns(model: RobotModel, steps: FloatArray, frames: FloatArray, load: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
+def _fit_step(base_from_flange: FloatArray, wanted_motion: FloatArray) -> FloatArray:
+    """(12, k): left twist of the base, then right twist of the flange, that best cause motions (12 m, k) of `_points`."""
+    points = _points(base_from_flange).reshape(len(base_from_flange), 4, 3)
+    rotation = base_from_flange[:, None, :3, :3]
+    of_base = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape, 3)), -se3.hat(points)], axis=-1)
+    of_flange = np.concatenate([np.broadcast_to(rotation, (*points.shape, 3)), -rotation @ se3.hat(_CORNERS_MM)], axis=-1)
+    design = np.concatenate([of_base, of_flange], axis=-1).reshape(-1, 12)
+    scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3] * 2)
+    # poses of one orientation cannot tell a shift of the flange from one of the base: the shorter motion is taken
+    return np.asarray(np.linalg.lstsq(design * scale, wanted_motion, rcond=1e-9)[0] * scale[:, None])
+
+
+def term_columns(link_twists: FloatArray, frames: FloatArray, load: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
     """(m, 3, K): motion of points (m, 3) carried by the flange per coefficient of deflection terms with loads (m, n, K)."""
     result = np.zeros((len(frames), 3, load.shape[-1]))
-    for i in range(model.n_joints):
+    turned = _frames_of_twists(frames, link_twists)
+    for i in range(load.shape[1]):
         if load[:, i].any():
-            turned = frames[:, i] @ steps[:, i]
-            motion = np.cross(turned[:, :3, 2], points_in_base_mm - turned[:, :3, 3])
+            motion = np.cross(turned[:, i, :3, 2], points_in_base_mm - turned[:, i, :3, 3])
             result += motion[:, :, None] * load[:, i, None, :]
     return result
 
 
-def link_columns(model: RobotModel, joints_rad: FloatArray, frames: FloatArray, link_twists: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
-    """(m, 3, 6 n): motion of points (m, 3) carried by the flange per component of the link twists (n, 6)."""
-    steps = mdh.link_transforms(model, joints_rad)
+def link_columns(link_twists: FloatArray, frames: FloatArray, points_in_base_mm: FloatArray) -> FloatArray:
+    """(m, 3, 6 n): motion of points (m, 3) carried by the flange per component of the link twists (n, 6).
+
+    Frames (m, n + 1, 4, 4) are those of `mdh.chain` with the same twists.
+    """
     left_jacobian = se3.left_jacobian(link_twists)
-    columns = [twist_columns(frames[:, i] @ steps[:, i], points_in_base_mm) @ left_jacobian[i] for i in range(len(link_twists))]
-    return np.concatenate(columns, axis=-1)
+    turned = _frames_of_twists(frames, link_twists)
+    return np.concatenate([twist_columns(turned[:, i], points_in_base_mm) @ left_jacobian[i] for i in range(len(link_twists))], axis=-1)
+
+
+def _frames_of_twists(frames: FloatArray, link_twists: FloatArray) -> FloatArray:
+    """(m, n, 4, 4): each axis turned (and yielded), its own twist not yet applied."""
+    return np.asarray(frames[:, 1:] @ se3.inverse(se3.exp(link_twists)))
 
 
 def twist_columns(base_from_frame: FloatArray, point_in_base_mm: FloatArray) -> FloatArray:
@@ -84,5 +110,4 @@ def twist_columns(base_from_frame: FloatArray, point_in_base_mm: FloatArray) -> 
 
 
 def _points(base_from_flange: FloatArray) -> FloatArray:
-    corners = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
-    return se3.apply(base_from_flange[:, None], corners).reshape(-1, 3)
+    return se3.apply(base_from_flange[:, None], _CORNERS_MM).reshape(-1, 3)

@@ -231,10 +231,9 @@ def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None
     camera_from_base_rotation = np.swapaxes(base_from_camera[:, :3, :3], -1, -2)
     motion = np.zeros((problem.n_shots, 3, layout.size))
     if problem.model is not None and problem.joints_rad is not None:
-        motion[:, :, layout.links] = link_columns(problem.model, problem.joints_rad, frames, state.link_twists, moving_point)
+        motion[:, :, layout.links] = link_columns(state.link_twists, frames, moving_point)
         if problem.terms:
-            steps = mdh.link_transforms(problem.model, problem.joints_rad)
-            motion[:, :, layout.terms] = term_columns(problem.model, steps, frames, problem.load, moving_point)
+            motion[:, :, layout.terms] = term_columns(state.link_twists, frames, problem.load, moving_point)
     motion[:, :, layout.hand_eye] = twist_columns(base_from_flange, moving_point)
     rows = np.arange(problem.n_shots)
     for axis in range(3):

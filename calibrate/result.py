@@ -202,15 +202,14 @@ class Calibration:
         if self.model is not None:
             q = np.broadcast_to(np.asarray(joints_rad, dtype=np.float64), (len(points), self.model.n_joints))
             frames = self._chain(self.model, q)
-            moved = link_columns(self.model, q, frames, self.link_twists, in_solver_base)
+            moved = link_columns(self.link_twists, frames, in_solver_base)
             rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
             blocks.append(moved + rigid @ datum_jacobian(self.datum, self.model, self.link_twists))
         blocks.append(twist_columns(flange, in_solver_base))
         basis = self.camera_error.basis(points)
         blocks.append(base_from_camera[:, :3, :3][:, :, self.camera_error.axis] * basis[:, None, :])
         if self.model is not None and self.terms:
-            steps = mdh.link_transforms(self.model, q)
-            blocks.append(term_columns(self.model, steps, frames, load_basis(self.terms, self.model, q), in_solver_base))
+            blocks.append(term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base))
         return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
 
     def to_json_dict(self) -> dict[str, object]:

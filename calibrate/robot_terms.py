@@ -45,11 +45,11 @@ class RobotTerm:
 def arm_terms(model: RobotModel) -> tuple[RobotTerm, ...]:
     """Every term that an arm can have.
 
-    Payload on every axis but the first (a vertical axis feels no gravity), the forearm's own mass on the two axes that
-    carry it, and a transmission error once a turn on every axis.
+    Payload on every axis but the first and the last (a vertical axis feels no gravity, the flange has no lever), the
+    forearm's own mass on the two axes that carry it, and a transmission error once a turn on every axis.
     """
     n = model.n_joints
-    payload = [RobotTerm("compliance", axis, n) for axis in range(1, n)]
+    payload = [RobotTerm("compliance", axis, n) for axis in range(1, n - 1)]
     forearm = [RobotTerm("compliance", axis, 4) for axis in (1, 2)] if n > 4 else []
     kinds: tuple[TermKind, TermKind] = ("sine", "cosine")
     transmission = [RobotTerm(kind, axis, 1) for axis in range(n) for kind in kinds]
