@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.problem import Geometry, Problem, State
+from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _HELD_RAD = 1e-12
@@ -198,6 +199,9 @@ def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     precision, value = np.zeros(layout.size), np.zeros(layout.size)
     precision[layout.links] = np.tile([priors.link_rho_mm**-2] * 3 + [priors.link_phi_rad**-2] * 3, layout.n_links)
     value[layout.links] = state.link_twists.ravel()
+    if problem.first_flange_from_camera is not None:
+        precision[layout.hand_eye] = [priors.hand_eye_mm**-2] * 3 + [priors.hand_eye_rad**-2] * 3
+        value[layout.hand_eye] = se3.log(state.flange_from_camera @ se3.inverse(problem.first_flange_from_camera))
     precision[layout.camera] = problem.camera_error.prior_sigma_mm**-2.0
     value[layout.camera] = state.camera_mm
     # terms that are not estimated are held by a prior that no data can move

@@ -33,6 +33,8 @@ class Priors:
     link_rho_mm: float = 1.0
     link_phi_rad: float = 2e-3
     radius_offset_mm: float = 0.1
+    hand_eye_mm: float = 100.0
+    hand_eye_rad: float = 0.3
     deflection_rad: float = 1.5e-4
     """Of an axis under gravity at full stretch."""
     transmission_rad: float = 3e-5
@@ -85,6 +87,8 @@ class Problem:
     """(m, n, K) of the terms."""
     estimate_terms: bool = False
     """Whether the terms are unknowns of the solve; else they stay zero and are only considered in the covariance."""
+    first_flange_from_camera: FloatArray | None = None
+    """(4, 4) the start's hand-eye transform: a far and weak hold where the shots leave the camera's orientation open."""
     along_sight: bool = True
     """Whether residuals run along the line of sight from the camera's origin (area cameras)."""
 

@@ -136,6 +136,7 @@ def solve_observations(
     models = _candidates(observations, cell, settings)
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
     start, keep, rejected = _start(first, cell)
+    first = replace(first, problem=replace(first.problem, first_flange_from_camera=start.flange_from_camera))
     if len(models) == 1:
         return _solve_and_reject(first, start, keep, rejected), {}
     keep = _kept_after_solve(first, start, keep)
