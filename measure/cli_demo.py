@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from measure.cli_run import AsJson, Debug, Quiet, command
+from measure.console import viewer_command
 
 if TYPE_CHECKING:
     from measure.console import Console
@@ -67,5 +68,5 @@ def tell_demo(console: Console, result: DemoResult, out: Path) -> None:
     console.say(f"workpiece: {stitched.n_points} points stitched from {stitched.n_scans} scans")
     console.say("")
     console.say(f"Look at {out / 'report.html'} in a browser, {out / 'cloud.ply'} in any point cloud viewer,")
-    console.say(f"and walk through every shot with: rerun {out / 'run.rrd'}")
+    console.say(f"and walk through every shot with: {viewer_command(out / 'run.rrd')}")
     console.say(f"Everything took {result.seconds:.0f} s. Each step again by hand: spherecal --help")

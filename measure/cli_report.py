@@ -9,6 +9,7 @@ import typer
 
 from measure.cli_measure import CalibrationFile
 from measure.cli_run import AsJson, Debug, Quiet, command
+from measure.console import LOCAL_ONLY, viewer_command
 
 if TYPE_CHECKING:
     from calibrate import Calibration
@@ -64,7 +65,7 @@ def show(
         require_writable(out)
         loaded = Calibration.load(calibration)
         record(out, loaded, [read_session(folder) for folder in sessions])
-        run.console.say(f"{out} written; look at it with: rerun {out}")
+        run.console.say(f"{out} written; look at it with: {viewer_command(out)}")
         if view:
             _open_viewer(out)
         run.finish({"out": out})
@@ -111,6 +112,7 @@ def _open_viewer(path: Path) -> None:
     from drivers.errors import SettingsError
 
     try:
-        subprocess.Popen([sys.executable, "-m", "rerun", str(path)], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        words = [sys.executable, "-m", "rerun", *LOCAL_ONLY, str(path)]
+        subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     except OSError as error:
-        raise SettingsError(f"the viewer cannot be started ({error})", remedy=f"Start it by hand: rerun {path}") from error
+        raise SettingsError(f"the viewer cannot be started ({error})", remedy=f"Start it by hand: {viewer_command(path)}") from error

@@ -165,3 +165,12 @@ def _cell(item: object) -> str:
 
 def _nothing(_done: int, _total: int) -> None:
     """Progress that nobody watches."""
+
+
+LOCAL_ONLY = ("--bind", "127.0.0.1")
+"""What Rerun's viewer must be told: by itself it listens on every network of the machine."""
+
+
+def viewer_command(recording: Path) -> str:
+    """The command that opens a recording in the viewer of this installation."""
+    return " ".join([str(Path(sys.executable).parent / "rerun"), *LOCAL_ONLY, str(recording)])
