@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from acquire.cell import Cell, Limits, cell_of_session, robot_model_of
 from acquire.check import check_session
+from calibrate.normal import NoiseModel
 from calibrate.observations import SphereShot
 from calibrate.plausibility import check_reported_poses
 from drivers.errors import DataError
@@ -64,6 +65,11 @@ class JudgedSystem(MeasuringSystem, Protocol):
     @property
     def shots(self) -> Sequence[TrainingShot]:
         """The shots it was made from."""
+        ...
+
+    @property
+    def noise(self) -> NoiseModel:
+        """What it found of noise, of the poses above all."""
         ...
 
     @property

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from acquire.cell import Cell, CertifiedLength, Limits, Sphere, cell_of_session, robot_model_of
+from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, SphereShot, gather_observations
 from drivers.errors import DataError
 from drivers.files.session import Session
@@ -187,11 +188,22 @@ def _figures_before(
 def _length(calibration: JudgedSystem, length: CertifiedLength, figures: Figures, observations: Observations) -> LengthResult:
     ends = [figures.spheres[name] for name in length.between]
     measured, scatter = separation(ends[0], ends[1])
-    test = float(np.hypot(scatter, length.standard_uncertainty_mm))
     shots = [[shot for shot in observations.shots if shot.sphere == name] for name in length.between]
+    # few views show little of their scatter by chance, and one shows none
+    scatter = max(scatter, _repeatability_mm(calibration.noise, ends, shots))
+    test = float(np.hypot(scatter, length.standard_uncertainty_mm))
     predicted = distance_standard_uncertainty_mm(calibration, End(ends[0].centre_in_base_mm, shots[0]), End(ends[1].centre_in_base_mm, shots[1]))
     total = float(np.hypot(test, predicted))
     return LengthResult(length.between, measured, length.length_mm, 2.0 * total, test, _why_not_judged(ends, shots))
+
+
+def _repeatability_mm(noise: NoiseModel, ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> float:
+    """Standard uncertainty of a length from the pose noise that the calibration found, each view's share averaged."""
+    variance = 0.0
+    for end, members in zip(ends, shots, strict=True):
+        levers = [np.linalg.norm(end.centre_in_base_mm - shot.base_from_flange[:3, 3]) for shot in members]
+        variance += float(noise.pose_mm**2 + noise.pose_rad**2 * np.mean(np.square(levers))) / len(members)
+    return float(np.sqrt(variance))
 
 
 def _why_not_judged(ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> str | None:

@@ -28,6 +28,9 @@ PLACES = {"A": (900.0, 100.0, 300.0), "B": (820.0, -250.0, 380.0)}
 LIMITS = {"centre_rms_mm": 0.2, "length_error_mm": 0.2, "diameter_error_mm": 0.1, "form_mm": 0.5}
 
 
+NEXT_TO_NO_NOISE = NoiseModel(point_mm=0.05, pose_mm=1e-6, pose_rad=1e-9)
+
+
 @dataclass(frozen=True)
 class TrainedOn:
     """A shot that a system was made from."""
@@ -47,6 +50,7 @@ class TrueSystem:
     shots: tuple[TrainedOn, ...] = ()
     sigma_of_scale: float = 3e-5
     sigma_of_radius_mm: float = 0.0
+    noise: NoiseModel = NEXT_TO_NO_NOISE
 
     @property
     def model(self) -> RobotModel | None:
