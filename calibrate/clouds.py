@@ -110,8 +110,8 @@ def solve_clouds(
 def rebased(problem: Problem, state: State, geometry: Geometry) -> Problem:
     """The problem with the camera basis taken where the points would be without their noise.
 
-    Taken at the noisy points it correlates with their residuals (errors in variables): 0.08 mm of depth noise then costs
-    0.015 mm of bias on the paper's cell, a tenth of which is left with the basis of the denoised points.
+    Taken at the noisy points it correlates with their residuals (errors in variables): 0.08 mm of depth noise then cost
+    0.015 mm of bias on the paper's cell; with the basis of the denoised points none was seen.
     """
     from calibrate import moments_kernels
 

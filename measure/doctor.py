@@ -19,7 +19,6 @@ from drivers.protocols import Camera3D, Frame3D, Robot, RobotState, Safety
 
 Facts: TypeAlias = dict[str, object]
 
-AGREES_MM = 0.2
 FACTORY_CALIBRATED_MM = 20.0
 FACTORY_CALIBRATED_RAD = 0.0175
 METRES_BELOW_MM = 10.0

@@ -15,7 +15,7 @@ from calibrate.observations import SphereShot
 from calibrate.plausibility import check_reported_poses
 from drivers.errors import DataError
 from drivers.files.session import Session, Shot
-from drivers.kinematics import mdh, se3
+from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
@@ -151,11 +151,6 @@ def nominal_base_from_camera(
     if model is not None and joints_rad is not None:
         return np.asarray(mdh.base_from_flange(model, joints_rad) @ np.asarray(first_guess))
     return None if base_from_flange is None else np.asarray(base_from_flange @ np.asarray(first_guess))
-
-
-def nominal_points_in_base_mm(base_from_camera: FloatArray, points_in_camera_mm: ArrayLike) -> FloatArray:
-    """Points (n, 3) as the uncalibrated cell sees them."""
-    return se3.apply(base_from_camera, np.asarray(points_in_camera_mm, dtype=np.float64))
 
 
 def _lacking(session: Session, shot: Shot, what: str, remedy: str) -> DataError:
