@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import MotionInterrupted, RobotTimeout, SafetyStop
+from drivers.errors import MotionInterrupted, RobotTimeout
 from drivers.kinematics import se3
-from drivers.protocols import Robot, RobotState, Safety
+from drivers.protocols import Robot, RobotState
+from drivers.readings import check_age, check_safety
 
 FloatArray = NDArray[np.float64]
 
@@ -60,14 +61,13 @@ def read_safely(robot: Robot) -> RobotState:
     """A reading of a robot in normal state.
 
     Raises:
-        SafetyStop: a protective or emergency stop is active.
+        SafetyStop: a protective, safeguard or emergency stop is active.
         RobotNotReached: the robot does not answer.
-        RobotTimeout: the same, late.
+        RobotTimeout: the same, late, or with an old reading.
     """
     state = robot.read_state()
-    if state.safety in {Safety.PROTECTIVE_STOP, Safety.EMERGENCY_STOP}:
-        kind = state.safety.value.replace("_", " ")
-        raise SafetyStop(f"the robot is in {kind}", remedy="Find the cause, clear it at the pendant, then continue with --resume.")
+    check_safety(state)
+    check_age(state)
     return state
 
 
@@ -94,7 +94,8 @@ def move(robot: Robot, target_rad: FloatArray, settings: MotionSettings) -> Iter
         if elapsed_s > deadline_s:
             halt(robot, settings)
             raise RobotTimeout(
-                f"the robot was not at its target within {deadline_s:.0f} s ({remaining_text(state, target_rad)}), and was stopped",
+                f"the robot was not at its target within {deadline_s:.0f} s ({remaining_text(state, target_rad)}), and was stopped"
+                f"{_controllers_word(state)}",
                 remedy="Is the speed override very low, or the robot held? Continue with --resume.",
             )
         yield state
@@ -102,7 +103,8 @@ def move(robot: Robot, target_rad: FloatArray, settings: MotionSettings) -> Iter
         waited_s += settings.poll_s
     if not _at(state, target_rad, settings):
         raise MotionInterrupted(
-            f"the robot stands {remaining_text(state, target_rad)}", remedy="Who stopped it? Look at the pendant, then continue with --resume."
+            f"the robot stands {remaining_text(state, target_rad)}{_controllers_word(state)}",
+            remedy="Who stopped it? Look at the pendant, then continue with --resume.",
         )
     yield state
 
@@ -180,6 +182,10 @@ def remaining_text(state: RobotState, target_rad: FloatArray) -> str:
         return "position unknown"
     axis = int(np.argmax(np.abs(state.joints_rad - target_rad)))
     return f"axis {axis + 1} {np.degrees(abs(state.joints_rad[axis] - target_rad[axis])):.3f} degrees from its target"
+
+
+def _controllers_word(state: RobotState) -> str:
+    return "" if state.reason is None else f"; the controller says: {state.reason}"
 
 
 def _mean_joints(states: Sequence[RobotState]) -> FloatArray | None:

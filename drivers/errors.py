@@ -5,11 +5,20 @@
     ├── SettingsError(ValueError)        a call or a command line asks for what cannot be
     ├── DataError(ValueError)            well-formed data that cannot be used: units, too few shots, no sphere
     ├── RobotError(RuntimeError)
-    │   ├── RobotNotReached(ConnectionError)   nobody answers, or the link is lost
+    │   ├── RobotNotReached(ConnectionError)   nobody answers
+    │   │   ├── LinkLost                           somebody did, and the link has gone
+    │   │   └── WrongController                    what answers is not the controller that was expected
     │   ├── RobotTimeout(TimeoutError)         an answer or a motion is late
+    │   │   └── StaleReading                       readings come, and are old
     │   ├── MotionRefused                      outside limits, or the controller says no
+    │   │   ├── NotInRemoteControl                 the pendant, or a person with an enabling switch, is the master
+    │   │   ├── MotorsOff                          no power on the drives, or brakes closed
+    │   │   └── ChannelTaken                       another client holds what is needed to command the robot
     │   ├── MotionInterrupted                  a started motion did not reach its target
-    │   └── SafetyStop                         protective or emergency stop is active
+    │   └── SafetyStop                         a stop is active
+    │       ├── ProtectiveStop
+    │       ├── SafeguardStop
+    │       └── EmergencyStop
     └── CameraError(RuntimeError)
         ├── CameraNotReached(ConnectionError)
         ├── CameraTimeout(TimeoutError)
@@ -85,12 +94,36 @@ class RobotNotReached(RobotError, ConnectionError):
     """Nobody answers at the robot's address, or the link was lost."""
 
 
+class LinkLost(RobotNotReached):
+    """The robot answered, and the link to it has gone since. Nothing is sent again by itself."""
+
+
+class WrongController(RobotNotReached):
+    """Something answers at the address, and it is not what was expected there."""
+
+
 class RobotTimeout(RobotError, TimeoutError):
     """An answer or a motion did not come within its deadline."""
 
 
+class StaleReading(RobotTimeout):
+    """The link stands and the readings that come over it are too old to be used."""
+
+
 class MotionRefused(RobotError):
     """A motion was not started: outside limits, wrong mode, or the controller declined."""
+
+
+class NotInRemoteControl(MotionRefused):
+    """The robot is in local or manual mode: programs and remote clients may not move it."""
+
+
+class MotorsOff(MotionRefused):
+    """The drives have no power, or the brakes are closed; spherecal never switches them on by itself."""
+
+
+class ChannelTaken(MotionRefused):
+    """Another client holds the registers, the port or the session through which the robot is commanded."""
 
 
 class MotionInterrupted(RobotError):
@@ -99,6 +132,18 @@ class MotionInterrupted(RobotError):
 
 class SafetyStop(RobotError):
     """A protective or emergency stop is active; spherecal never clears one by itself."""
+
+
+class ProtectiveStop(SafetyStop):
+    """The controller stopped the arm: a collision, a force, a limit."""
+
+
+class SafeguardStop(SafetyStop):
+    """A door, a mat or a light curtain holds the robot."""
+
+
+class EmergencyStop(SafetyStop):
+    """An emergency stop is pressed, or was and has not been reset."""
 
 
 class CameraError(SpherecalError, RuntimeError):

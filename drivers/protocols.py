@@ -2,13 +2,21 @@
 
 Units are mm, rad and s; `base_from_flange` follows `drivers.kinematics.se3`. A device object does no I/O in its
 constructor: `open` connects, `close` may be called any number of times, and one thread owns it.
+
+What every robot adapter promises (docs/add_a_robot.md; `drivers.contract.robot` tests it):
+
+* a reading is fresh (`RobotState.age_s` at most `MAX_AGE_S`) or an error, never the last known value;
+* every call ends within its deadline (`CONNECT_S`, `SILENCE_S`), whatever the controller does;
+* a motion that was refused or interrupted is a typed error with the controller's own reason, as far as it gives one;
+* nothing is sent again after a lost link by itself: the caller opens anew, and decides;
+* no protective stop is ever cleared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, StrEnum
 from types import TracebackType
 from typing import Literal, Protocol, Self, runtime_checkable
 
@@ -18,12 +26,43 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 
+CONNECT_S = 3.0
+"""Longest time of `open`, whatever is at the address."""
+SILENCE_S = 1.0
+"""Longest time of any other call, when the controller says nothing."""
+MAX_AGE_S = 0.05
+"""An older reading is none: adapters raise StaleReading."""
+
+
 class Safety(Enum):
     """What the controller says about its safety state."""
 
     NORMAL = "normal"
+    REDUCED = "reduced"
+    """Moves, at a speed that the safety configuration bounds."""
     PROTECTIVE_STOP = "protective_stop"
+    SAFEGUARD_STOP = "safeguard_stop"
+    """A door or a light curtain; ends by itself when it closes."""
     EMERGENCY_STOP = "emergency_stop"
+    FAULT = "fault"
+    """The safety system itself has failed."""
+    UNKNOWN = "unknown"
+
+    @property
+    def stops_motion(self) -> bool:
+        """Whether the robot cannot move until somebody acts at it."""
+        return self in {Safety.PROTECTIVE_STOP, Safety.SAFEGUARD_STOP, Safety.EMERGENCY_STOP, Safety.FAULT}
+
+
+class Mode(StrEnum):
+    """Who is master of the robot's motions."""
+
+    AUTOMATIC = "automatic"
+    """Programs and remote clients may move it (UR: remote control; ABB: AUTO)."""
+    MANUAL = "manual"
+    """A person with an enabling switch (ABB: MANR, MANF; UR: manual)."""
+    LOCAL = "local"
+    """The pendant only (UR: local control)."""
     UNKNOWN = "unknown"
 
 
@@ -50,7 +89,18 @@ class RobotState:
     """`time.monotonic()` of the reading (simulated cells: their own clock)."""
     moving: bool
     safety: Safety = Safety.NORMAL
-    mode: str = "automatic"
+    mode: str = Mode.AUTOMATIC
+    """One of `Mode`."""
+    age_s: float = 0.0
+    """How old the reading was when it was handed over, transport included as far as it can be known."""
+    motors_on: bool | None = None
+    """Drives powered and brakes free; None where the controller does not tell."""
+    reason: str | None = None
+    """Why the robot does not move or stopped, in the controller's own words."""
+    active_tool: str | None = None
+    """Tool that the controller's poses refer to: `tool0` for the bare flange, None where unknown."""
+    active_work_object: str | None = None
+    """Frame that the controller's poses refer to: `wobj0` for the base, None where unknown."""
 
 
 @runtime_checkable
@@ -62,15 +112,20 @@ class Robot(Protocol):
         ...
 
     def read_state(self) -> RobotState:
-        """A fresh reading (never a stale one), or RobotNotReached / RobotTimeout."""
+        """A fresh reading (never a stale one), or RobotNotReached / RobotTimeout. An active stop is told, not raised."""
         ...
 
     def start_move(self, joints_rad: FloatArray, *, speed_rad_s: float) -> None:
-        """Start a motion to axis angles (n,) and return at once; raises MotionRefused or SafetyStop."""
+        """Start a motion to axis angles (n,) and return at once; raises MotionRefused or SafetyStop.
+
+        No axis is faster than `speed_rad_s`. Number, finiteness and limits of the angles are checked before anything is
+        sent. How long the motion may take, and that the robot then stands still, is `acquire.motion`'s to see; an
+        adapter whose process may die with the robot moving stops it by itself.
+        """
         ...
 
     def stop(self) -> None:
-        """Stop now, in any state; returns when the controller has the command."""
+        """Stop now, in any state and from any open or lost link; returns when the controller has the command."""
         ...
 
     def wait(self, seconds: float) -> None:
@@ -79,6 +134,19 @@ class Robot(Protocol):
 
     def close(self) -> None:
         """Release the robot; safe to call twice and after errors."""
+        ...
+
+
+@runtime_checkable
+class HandGuided(Protocol):
+    """What a robot that can be led by hand has besides `Robot`; ask with `isinstance`."""
+
+    def start_freedrive(self) -> None:
+        """Let a person push the arm; raises MotionRefused or SafetyStop."""
+        ...
+
+    def end_freedrive(self) -> None:
+        """Hold the arm again where it is; without effect when it is held."""
         ...
 
 

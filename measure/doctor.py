@@ -15,7 +15,7 @@ from acquire.cell import Cell, devices_of, robot_model_of
 from drivers.errors import SpherecalError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
-from drivers.protocols import Camera3D, Frame3D, Robot, RobotState, Safety
+from drivers.protocols import Camera3D, Frame3D, Robot, RobotState
 
 Facts: TypeAlias = dict[str, object]
 
@@ -117,8 +117,9 @@ def examine_robot(robot: Robot, model: RobotModel | None, diagnosis: Diagnosis) 
 def robot_problems(state: RobotState, model: RobotModel | None) -> list[str]:
     """What is wrong with one reading of a robot."""
     problems = []
-    if state.safety in (Safety.PROTECTIVE_STOP, Safety.EMERGENCY_STOP):
-        problems.append(f"{state.safety.value.replace('_', ' ')} is active. Clear it at the robot.")
+    if state.safety.stops_motion:
+        said = "" if state.reason is None else f" ({state.reason})"
+        problems.append(f"{state.safety.value.replace('_', ' ')} is active{said}. Clear it at the robot.")
     if model is None:
         return problems if state.base_from_flange is not None else [*problems, "gives no flange pose, and the cell names no robot model"]
     if state.joints_rad is None:
