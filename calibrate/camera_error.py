@@ -12,11 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import comb
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibrate.polynomials import Polynomials, legendre, monomials
 from drivers.errors import FileError, SettingsError
 from drivers.kinematics.se3 import FloatArray
 
@@ -46,6 +48,11 @@ class CameraError(Protocol):
         """(n, k) values of the terms at points (n, 3)."""
         ...
 
+    @property
+    def polynomials(self) -> Polynomials:
+        """The same terms as a table for the kernels."""
+        ...
+
     def settings(self) -> dict[str, object]:
         """What a file must hold to make this model again with `camera_error_from_settings`."""
         ...
@@ -70,6 +77,11 @@ class NoCameraError:
     def basis(self, points_in_camera_mm: ArrayLike) -> FloatArray:
         """(n, 0)."""
         return np.zeros((len(np.asarray(points_in_camera_mm)), 0))
+
+    @property
+    def polynomials(self) -> Polynomials:
+        """An empty table."""
+        return monomials((), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
     def settings(self) -> dict[str, object]:
         """Nothing to keep."""
@@ -104,6 +116,13 @@ class PillowError:
         z = (points[:, 2] - self.sight_crossing_mm[2]) / PILLOW_SCALE_MM
         r2 = x * x + z * z
         return np.stack([z * r2 ** (i + 1) for i in range(self.n_terms)], axis=-1)
+
+    @property
+    def polynomials(self) -> Polynomials:
+        """z r^(2i) by the binomial theorem."""
+        powers = range(1, self.n_terms + 1)
+        terms = [(2, [(float(comb(i, j)), (2 * j, 0, 2 * (i - j) + 1)) for j in range(i + 1)]) for i in powers]
+        return monomials(terms, self.sight_crossing_mm, (PILLOW_SCALE_MM,) * 3)
 
     def coefficients_k(self, coefficients_mm: ArrayLike) -> FloatArray:
         """The paper's k_i (mm^-2i) of scaled coefficients in mm."""
@@ -159,14 +178,19 @@ class PolynomialError:
         """(n, k) products of Legendre polynomials; linear beyond the box, so that extrapolation stays tame."""
         points = np.asarray(points_in_camera_mm, dtype=np.float64)
         scaled = (points - np.asarray(self.centre_mm)) / np.asarray(self.half_size_mm)
-        legendre = _legendre_tame(scaled, max(self.degree, self.lateral_degree))
+        values = _legendre_tame(scaled, max(self.degree, self.lateral_degree))
         result = np.empty((len(points), len(self.terms)))
         products: dict[tuple[int, int, int], FloatArray] = {}
         for column, (_, (i, j, k)) in enumerate(self.terms):
             if (i, j, k) not in products:
-                products[i, j, k] = legendre[i][:, 0] * legendre[j][:, 1] * legendre[k][:, 2]
+                products[i, j, k] = values[i][:, 0] * values[j][:, 1] * values[k][:, 2]
             result[:, column] = products[i, j, k]
         return result
+
+    @property
+    def polynomials(self) -> Polynomials:
+        """One product a term."""
+        return legendre([(axis, [(1.0, degrees)]) for axis, degrees in self.terms], self.centre_mm, self.half_size_mm)
 
     def settings(self) -> dict[str, object]:
         """Box, degrees and smoothness."""
