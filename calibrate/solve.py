@@ -6,7 +6,7 @@ import datetime
 import importlib.metadata
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,11 +16,12 @@ from acquire.cell import Cell, cell_of_session, robot_model_of
 from acquire.check import check_session
 from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
+from calibrate.centres import cross_validate_centres, solve_centres
 from calibrate.clouds import Solution, solve_clouds
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot, gather_observations
 from calibrate.plausibility import check_reported_poses
-from calibrate.problem import Priors, State
+from calibrate.problem import Priors, Problem, State
 from calibrate.report_figures import make_result
 from calibrate.result import Calibration
 from calibrate.start import start_from_centres
@@ -50,7 +51,7 @@ class CalibrationSettings:
     camera_error: str = "auto"
     """auto, none, affine, pillow or field."""
     method: str = "clouds"
-    """clouds, or stepwise for the paper's solver."""
+    """clouds, centres for one fitted centre a shot, or stepwise for the paper's solver."""
     priors: Priors = field(default_factory=Priors)
 
 
@@ -62,6 +63,17 @@ class Solved:
     solution: Solution
     held_out: Prediction
     rejected: tuple[RejectedShot, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Solver:
+    """What the methods differ in; starts, choice of the camera model and rejection are the same."""
+
+    solve: Callable[[Problem, State, NoiseModel], Solution]
+    held_out: Callable[[Solution], Prediction]
+
+
+_SOLVERS = {"clouds": _Solver(solve_clouds, cross_validate), "centres": _Solver(solve_centres, cross_validate_centres)}
 
 
 def calibrate(sessions: Sequence[Session], settings: CalibrationSettings | None = None) -> Calibration:
@@ -131,23 +143,24 @@ def solve_observations(
         from calibrate.stepwise_sessions import solve_stepwise_sessions
 
         return solve_stepwise_sessions(observations, cell, model, settings), {}
-    if settings.method != "clouds":
-        raise SettingsError(f"unknown method {settings.method!r}", remedy="Choose clouds or stepwise.")
+    solver = _SOLVERS.get(settings.method)
+    if solver is None:
+        raise SettingsError(f"unknown method {settings.method!r}", remedy=f"Choose {', '.join(_SOLVERS)} or stepwise.")
     models = _candidates(observations, cell, settings)
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
     start, keep, rejected = _start(first, cell)
     first = replace(first, problem=replace(first.problem, first_flange_from_camera=start.flange_from_camera))
     if len(models) == 1:
-        return _solve_and_reject(first, start, keep, rejected), {}
-    keep = _kept_after_solve(first, start, keep)
+        return _solve_and_reject(solver, first, start, keep, rejected), {}
+    keep = _kept_after_solve(solver, first, start, keep)
     thin = _thinned(first)
-    tried = [_solve(thin.subset(keep, model_), _for_model(start, model_)) for model_ in models]
+    tried = [_solve(solver, thin.subset(keep, model_), _for_model(start, model_)) for model_ in models]
     chosen = _simplest_of_the_best(tried)
     compared = {t.assembled.problem.camera_error.name: _held_out_rms(t) for t in tried}
     _LOG.debug("held-out rms by camera error model: %s", compared)
     state = without_pose_noise(tried[chosen].solution.state, first.problem.n_scans)
     everything = first.subset(np.arange(first.problem.n_shots), models[chosen])
-    return _solve_and_reject(everything, state, keep, rejected), compared
+    return _solve_and_reject(solver, everything, state, keep, rejected), compared
 
 
 def _candidates(observations: Observations, cell: Cell, settings: CalibrationSettings) -> list[CameraError]:
@@ -170,30 +183,30 @@ def _start(assembled: Assembled, cell: Cell) -> tuple[State, NDArray[np.int64], 
     return start.state, np.flatnonzero(~start.spoiled), rejected
 
 
-def _solve(assembled: Assembled, start: State) -> Solved:
+def _solve(solver: _Solver, assembled: Assembled, start: State) -> Solved:
     state = without_pose_noise(start, assembled.problem.n_scans)
-    solution = solve_clouds(assembled.problem, state, _FIRST_NOISE)
-    return Solved(assembled, solution, cross_validate(solution), ())
+    solution = solver.solve(assembled.problem, state, _FIRST_NOISE)
+    return Solved(assembled, solution, solver.held_out(solution), ())
 
 
-def _solve_and_reject(everything: Assembled, start: State, keep: NDArray[np.int64], rejected: tuple[RejectedShot, ...]) -> Solved:
+def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64], rejected: tuple[RejectedShot, ...]) -> Solved:
     """Solve, reject the shots that the noise cannot explain, and solve again until none is left."""
     for _ in range(_REJECT_ROUNDS):
         part = everything.subset(keep)
-        solution = solve_clouds(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
+        solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
         far, miss_mm = _unexplained(part, solution)
         if not far.any():
             break
         rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))
         keep, start = keep[~far], solution.state
-    return Solved(part, solution, cross_validate(solution), rejected)
+    return Solved(part, solution, solver.held_out(solution), rejected)
 
 
-def _kept_after_solve(everything: Assembled, start: State, keep: NDArray[np.int64]) -> NDArray[np.int64]:
+def _kept_after_solve(solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64]) -> NDArray[np.int64]:
     thin = _thinned(everything)
     for _ in range(_REJECT_ROUNDS):
         part = thin.subset(keep)
-        solution = solve_clouds(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
+        solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
         far, _ = _unexplained(part, solution)
         if not far.any():
             break

@@ -28,9 +28,10 @@ class CameraErrorChoice(StrEnum):
 
 
 class Method(StrEnum):
-    """Solvers: every point at once, or the paper's Algorithm 1 on sphere centres."""
+    """Solvers: every point at once, one fitted centre a shot, or the paper's Algorithm 1 on sphere centres."""
 
     clouds = "clouds"
+    centres = "centres"
     stepwise = "stepwise"
 
 
