@@ -31,8 +31,11 @@ def make_robot(context: DriverContext) -> Robot:
 
 
 def make_camera(context: DriverContext) -> Camera3D:
-    """The simulated camera of a cell file, on the same truth as its robot; raises as `make_robot`."""
-    from drivers.simulated.camera import SimulatedCamera
-    from drivers.simulated.setup import shared_cell
+    """The simulated camera of a cell file, on the same truth as its robot; raises as `make_robot`.
 
-    return SimulatedCamera(shared_cell(context))
+    With the setting `controller` it looks from where a robot of `spherecal simulate-controller` stands.
+    """
+    from drivers.simulated.camera import SimulatedCamera
+    from drivers.simulated.setup import follower, shared_cell
+
+    return SimulatedCamera(shared_cell(context), follower(context))

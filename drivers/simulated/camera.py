@@ -6,6 +6,7 @@ Not modelled: blur (a frame shows the scene at its trigger, even while the robot
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,16 @@ _CHUNK = 32768
 
 
 class SimulatedCamera:
-    """A camera of the `Camera3D` protocol on a simulated cell."""
+    """A camera of the `Camera3D` protocol on a simulated cell.
 
-    def __init__(self, cell: SimulatedCell) -> None:
+    Args:
+        cell: The truth that it sees.
+        follow: Called before every exposure, to bring the cell's axes where a robot in another process has its own.
+    """
+
+    def __init__(self, cell: SimulatedCell, follow: Callable[[SimulatedCell], None] | None = None) -> None:
         self._cell = cell
+        self._follow = follow
         self._opened = False
         self._sequence = 0
         self._grid: RayGrid | None = None
@@ -49,7 +56,7 @@ class SimulatedCamera:
         """A frame of the scene as it is now; the exposure then takes its time on the cell's clock.
 
         Raises:
-            CameraNotReached: before `open` or after `close`.
+            CameraNotReached: before `open` or after `close`, or the simulated controller that it follows is gone.
             CameraTimeout: the exposure is longer than `timeout_s`.
             FileError: the workpiece's mesh file cannot be read.
         """
@@ -58,6 +65,8 @@ class SimulatedCamera:
             raise CameraNotReached("the simulated camera is not open", remedy="Open it first, e.g. in a `with devices:` block.")
         if camera.exposure_s > timeout_s:
             raise CameraTimeout(f"the exposure takes {camera.exposure_s} s, {timeout_s} s are allowed", remedy="Allow more time.")
+        if self._follow is not None:
+            self._follow(cell)
         self._sequence += 1
         self._grid = self._grid or ray_grid(camera)
         time_s = cell.clock_s

@@ -29,6 +29,22 @@ _STREAM_STOP, _STREAM_ENCODER, _STREAM_FRAME = 1, 2, 3
 _STILL_RAD = 1e-12
 
 
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """Where the axes of a cell stand or move, as plain numbers that go over a wire unchanged."""
+
+    clock_s: float
+    start_rad: tuple[float, ...]
+    target_rad: tuple[float, ...]
+    start_s: float
+    duration_s: float
+    ramp_s: float
+    approach: tuple[float, ...]
+    n_motions: int
+    asked_rad: tuple[float, ...]
+    """Target that the last motion was started with: its stop noise hangs on it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
     """A synchronous motion of all axes with a trapezoid of speed."""
@@ -102,6 +118,7 @@ class SimulatedCell:
         self._approach = np.zeros(model.n_joints)
         self._n_motions = 0
         self._n_readings = 0
+        self._asked = home
         self._noise: StopNoise = no_noise(model)
         self._mesh: Mesh | None = None
 
@@ -152,12 +169,31 @@ class SimulatedCell:
             now, target, start_s=self.clock_s, speed_rad_s=speed_rad_s, acceleration_rad_s2=self.truth.robot.acceleration_rad_s2
         )
         self._n_motions += 1
-        self._noise = draw_stop_noise(self.model, self.truth.robot, self.rng(_STREAM_STOP, self._n_motions, target))
+        self._asked = target
+        self._noise = self._stop_noise()
 
     def stop_motion(self) -> None:
         """Stand still at once, where the axes are."""
         now = self.joints_rad()
         self._motion = Motion(now, now, self.clock_s, 0.0, 0.0)
+
+    def axes(self) -> Axes:
+        """What another process needs to show the same robot."""
+        motion = self._motion
+        start, target, approach, asked = (tuple(row.tolist()) for row in (motion.start_rad, motion.target_rad, self._approach, self._asked))
+        return Axes(self.clock_s, start, target, motion.start_s, motion.duration_s, motion.ramp_s, approach, self._n_motions, asked)
+
+    def take_axes(self, axes: Axes) -> None:
+        """Let the axes, and in instant mode the clock, be those of another cell with the same truth and model."""
+        if self._instant:
+            self._clock_s = axes.clock_s
+        start, target = np.array(axes.start_rad), np.array(axes.target_rad)
+        self._motion = Motion(start, target, self.clock_s - axes.clock_s + axes.start_s, axes.duration_s, axes.ramp_s)
+        self._approach, self._asked, self._n_motions = np.array(axes.approach), np.array(axes.asked_rad), axes.n_motions
+        self._noise = self._stop_noise() if axes.n_motions else no_noise(self.model)
+
+    def _stop_noise(self) -> StopNoise:
+        return draw_stop_noise(self.model, self.truth.robot, self.rng(_STREAM_STOP, self._n_motions, self._asked))
 
     def true_base_from_flange(self) -> FloatArray:
         """(4, 4) where the flange truly is now."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ SETTINGS = {
     "truth": "the truth file, relative to the cell file; with the robot, the camera may repeat it",
     "instant": "true (default): a clock of its own, nothing sleeps; false: real time",
     "run": "a whole number: another one gives other noise with the same errors (default 0)",
+    "controller": "camera only: address HOST or HOST:PORT of the `simulate-controller` whose robot carries it",
     "clock_start_s": "first reading of the cell's clock, by which it drifts (default 0)",
 }
 
@@ -44,6 +45,25 @@ def shared_cell(context: DriverContext) -> SimulatedCell:
     made = _Made(_make(context, settings), settings)
     context.shared[_SHARED] = made
     return made.cell
+
+
+def follower(context: DriverContext) -> Callable[[SimulatedCell], None] | None:
+    """What brings a camera's cell to where a simulated controller's robot stands, None without the setting `controller`.
+
+    Raises:
+        SettingsError: the address cannot be read.
+    """
+    address = context.settings.get("controller")
+    if not isinstance(address, str):
+        return None
+    from drivers.simulated.controllers.bench import BenchClient, bench_address
+
+    client = BenchClient(*bench_address(address))
+
+    def follow(cell: SimulatedCell) -> None:
+        cell.take_axes(client.axes())
+
+    return follow
 
 
 def _check_same(settings: Mapping[str, object], first: Mapping[str, object]) -> None:
@@ -73,7 +93,7 @@ def _make(context: DriverContext, settings: Mapping[str, object]) -> SimulatedCe
 
 
 def _checked(settings: Mapping[str, object]) -> Mapping[str, object]:
-    kinds: dict[str, type | tuple[type, ...]] = {"truth": str, "instant": bool, "run": int, "clock_start_s": (int, float)}
+    kinds: dict[str, type | tuple[type, ...]] = {"truth": str, "instant": bool, "run": int, "clock_start_s": (int, float), "controller": str}
     for key, value in settings.items():
         if key not in SETTINGS:
             raise SettingsError(f"unknown setting {key!r} of the simulated driver", where=key, remedy=f"Allowed: {', '.join(SETTINGS)}.")

@@ -1,0 +1,276 @@
+"""`spherecal.mod` once more, in Python: what the RAPID program does with a line, on a simulated robot.
+
+Written from the RAPID text, routine by routine, so that the client is tried against the same rules: one cached reply,
+targets with a token that lives 5 s, epochs, the dead man's switch, the supervised restart. Numbers pass through single
+precision where RAPID's `num` would round them. Not modelled: the time that RAPID itself takes, motion supervision,
+singularities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.abb.protocol import (
+    ANSWERS,
+    ARGUMENTS,
+    FASTEST_DEG_S,
+    LAST_EPOCH,
+    LENGTH_DECIMALS,
+    MASTER_VERBS,
+    N_AXES,
+    QUATERNION_DECIMALS,
+    TOKEN_LIFE_S,
+    VERSION,
+    BadLine,
+    Code,
+    Fault,
+    Line,
+    Outcome,
+    StateReply,
+    Verb,
+    angle_text,
+    decode,
+    encode,
+    number_text,
+    numbers,
+    state_arguments,
+    whole,
+)
+from drivers.kinematics import mdh
+from drivers.kinematics.se3 import FloatArray
+from drivers.simulated.cell import SimulatedCell
+
+RAMP_S = 0.5
+"""Added to way over speed, so that the controller's own acceleration never needs more than the speed asked for."""
+_FAULT_TEXTS = {
+    Fault.SYNTAX: "syntax",
+    Fault.VERB: "unknown verb",
+    Fault.EPOCH: "another epoch",
+    Fault.TOKEN: "no such target",
+    Fault.EXPIRED: "target expired",
+    Fault.BUSY: "moving",
+    Fault.SPEED: "speed",
+    Fault.NUMBER: "number used for another request",
+    Fault.NOT_READY: "not ready",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Target:
+    token: int
+    joints_deg: FloatArray
+    given_s: float
+
+
+class _No(Exception):
+    """A request that is answered by an error."""
+
+    def __init__(self, fault: Fault) -> None:
+        super().__init__()
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What GetSysInfo and GetSysData would say."""
+
+    serial: str = "SIMULATED-0001"
+    version: str = "6.08.0134"
+    kind: str = "IRB 1410-5/1.44"
+    tool: str = "sphTool"
+    work_object: str = "wobj0"
+
+
+class AbbProgram:
+    """The program's variables and routines; the caller holds a lock around every call.
+
+    Args:
+        cell: the robot.
+        now: seconds of a clock that never goes back.
+        identity: what it says it is.
+    """
+
+    def __init__(self, cell: SimulatedCell, now: Callable[[], float], identity: Identity | None = None) -> None:
+        self.cell, self._now = cell, now
+        self.identity = identity or Identity()
+        self.epoch = 1
+        self.n_motions = 0
+        self.held = False
+        """Whether the program stands still (emergency stop, stop button): then it answers nothing."""
+        self.stop_letter, self.motors, self.mode = "N", "1", "A"
+        self._outcome, self._last_token = Outcome.NONE, 0
+        self._target: _Target | None = None
+        self._cached: tuple[bytes, bytes] | None = None
+        self._heard_s, self._watchdog_s = now(), 3.0
+        self._path_rad: FloatArray | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion is under way."""
+        return self._outcome is Outcome.RUNNING
+
+    def answer(self, data: bytes) -> bytes:
+        """The reply to a line; a repeated request gets the same words and does nothing (PROC SphAnswer)."""
+        self.tick()
+        try:
+            line = decode(data)
+        except BadLine:
+            return encode(0, Code.ERROR, str(int(Fault.CHECKSUM)), "checksum")
+        self._heard_s = self._now()
+        if self._cached is not None and self._cached[0] == data and line.word != Verb.HELLO:
+            return self._cached[1]
+        try:
+            if self._cached is not None and self._cached[0][:4] == data[:4] and line.word != Verb.HELLO:
+                raise _No(Fault.NUMBER)
+            reply = encode(line.number, ANSWERS[Verb(line.word)], *self._do(line))
+        except _No as no:
+            reply = encode(line.number, Code.ERROR, str(int(no.fault)), *_FAULT_TEXTS[no.fault].split())
+        except (BadLine, ValueError):
+            fault = Fault.SYNTAX if line.word in tuple(Verb) else Fault.VERB
+            reply = encode(line.number, Code.ERROR, str(int(fault)), *_FAULT_TEXTS[fault].split())
+        self._cached = (data, reply)
+        return reply
+
+    def _do(self, line: Line) -> tuple[str, ...]:
+        verb = Verb(line.word)
+        if verb in MASTER_VERBS and verb is not Verb.HELLO:
+            raise _No(Fault.VERB)
+        if len(line.arguments) != ARGUMENTS[verb]:
+            raise _No(Fault.SYNTAX)
+        routines: dict[Verb, Callable[[Line], tuple[str, ...]]] = {
+            Verb.HELLO: lambda _: (str(VERSION), str(self.epoch)),
+            Verb.INFO: self._info,
+            Verb.TOOL: lambda _: (self.identity.tool, self.identity.work_object),
+            Verb.STATE: lambda _: state_arguments(self.state()),
+            Verb.POSE: lambda _: self._pose(),
+            Verb.TARGET: self._take_target,
+            Verb.GO: self._go,
+            Verb.LAST: lambda _: (str(self.epoch), f"{self._last_token:04d}", str(int(self._outcome))),
+            Verb.STOP: lambda _: self._stop(),
+        }
+        return routines[verb](line)
+
+    def _info(self, line: Line) -> tuple[str, ...]:
+        which = whole(line.arguments[0], 3)
+        text = {1: self.identity.serial, 2: self.identity.version, 3: self.identity.kind}.get(which)
+        if text is None:
+            raise _No(Fault.SYNTAX)
+        return (str(which), *text.split())
+
+    def state(self, *, seen_from_outside: bool = False) -> StateReply:
+        """What `J` tells; motors and stop only the second program knows."""
+        self.tick()
+        joints_deg = np.degrees(self.cell.read_joints_rad()).astype(np.float32)
+        letters = {Outcome.NONE: "R", Outcome.RUNNING: "M", Outcome.REACHED: "D"}
+        motion = letters.get(self._outcome, "X")
+        flags = (self.motors, self.stop_letter) if seen_from_outside else ("-", "-")
+        return StateReply(self.epoch, tuple(float(angle) for angle in joints_deg), "X" if self.held and motion == "M" else motion, self.mode, *flags)
+
+    def _pose(self) -> tuple[str, ...]:
+        flange = mdh.base_from_flange(self.cell.model, self.cell.read_joints_rad())
+        xyz = (number_text(float(np.float32(value)), LENGTH_DECIMALS) for value in flange[:3, 3])
+        return (*xyz, *(number_text(float(np.float32(value)), QUATERNION_DECIMALS) for value in quaternion_wxyz(flange[:3, :3])))
+
+    def _take_target(self, line: Line) -> tuple[str, ...]:
+        if self.moving:
+            raise _No(Fault.BUSY)
+        joints_deg = np.array(numbers(line.arguments, N_AXES))
+        self._target = _Target(line.number, joints_deg, self._now())
+        return tuple(angle_text(float(angle)) for angle in joints_deg.astype(np.float32))
+
+    def _go(self, line: Line) -> tuple[str, ...]:
+        epoch, token = whole(line.arguments[0], LAST_EPOCH), whole(line.arguments[1], 9999)
+        speed_deg_s, watchdog_s = numbers(line.arguments[2:], 2)
+        if self.moving:
+            raise _No(Fault.BUSY)
+        if epoch != self.epoch:
+            raise _No(Fault.EPOCH)
+        target, self._target = self._target, None
+        if target is None or target.token != token:
+            raise _No(Fault.TOKEN)
+        if self._now() - target.given_s > TOKEN_LIFE_S:
+            raise _No(Fault.EXPIRED)
+        if not (0 < speed_deg_s <= FASTEST_DEG_S and 0 < watchdog_s <= 30):
+            raise _No(Fault.SPEED)
+        way_deg = float(np.abs(target.joints_deg - np.degrees(self.cell.joints_rad())).max())
+        self._begin(np.radians(target.joints_deg), float(np.radians(speed_deg_s)))
+        self._watchdog_s, self._last_token, self._outcome = watchdog_s, token, Outcome.RUNNING
+        return str(self.epoch), f"{token:04d}", number_text(way_deg / speed_deg_s + RAMP_S, 2)
+
+    def _begin(self, target_rad: FloatArray, speed_rad_s: float) -> None:
+        self.n_motions += 1
+        self.cell.start_motion(target_rad, speed_rad_s=speed_rad_s)
+
+    def _stop(self) -> tuple[str, ...]:
+        self._target = None
+        if self.moving:
+            self._give_up(Outcome.STOPPED)
+        return (str(self.epoch),)
+
+    def _give_up(self, outcome: Outcome) -> None:
+        """StopMove, ClearPath, StartMove, ExitCycle."""
+        self.cell.stop_motion()
+        self._outcome = outcome
+
+    def tick(self) -> None:
+        """What TRAP SphPoll and the end of MoveAbsJ see: arrival, silence of the computer."""
+        if self.held or not self.moving:
+            return
+        if not self.cell.moving():
+            self._outcome = Outcome.REACHED
+        elif self._now() - self._heard_s > self._watchdog_s:
+            self._give_up(Outcome.SILENCE)
+
+    def link_lost(self) -> None:
+        """The socket closed: a motion is given up."""
+        self.tick()
+        self._target = None
+        if self.moving and not self.held:
+            self._give_up(Outcome.LINK_LOST)
+
+    def hold(self, stop_letter: str, *, motors_on: bool) -> None:
+        """The controller stops the program, wherever it is; the path is kept, as a real one keeps it."""
+        self.tick()
+        self.held, self.stop_letter, self.motors = True, stop_letter, "1" if motors_on else "0"
+        if self.moving:
+            self._path_rad = np.array(self.cell.axes().target_rad)
+            self.cell.stop_motion()
+
+    def clear_stop(self) -> None:
+        """The stop is reset and the motors are on; the program is still held."""
+        self.stop_letter, self.motors = "N", "1"
+
+    def press_start(self) -> None:
+        """Start without moving the program pointer: SphOnRestart and the trap give the kept path up."""
+        if not self.held:
+            return
+        self.clear_stop()
+        self.held = False
+        self._heard_s = self._now()
+        self._target = None
+        if self.moving:
+            self._path_rad = None
+            self._give_up(Outcome.HELD)
+
+    def pp_to_main(self) -> None:
+        """The program starts from its beginning: new epoch, no path, no target, no cached reply."""
+        self.clear_stop()
+        self.held = False
+        self.cell.stop_motion()
+        self.epoch = self.epoch % LAST_EPOCH + 1
+        self._outcome, self._last_token, self._target, self._cached, self._path_rad = Outcome.NONE, 0, None, None, None
+
+    def use(self, **changes: str) -> None:
+        """Another identity."""
+        self.identity = replace(self.identity, **changes)  # type: ignore[arg-type]
+
+
+def quaternion_wxyz(rotation: FloatArray) -> FloatArray:
+    """(4,) of a rotation matrix, w not negative."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return np.array([w, x, y, z])
