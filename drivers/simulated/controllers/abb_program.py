@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drivers.abb.protocol import (
     ANSWERS,
@@ -120,10 +121,12 @@ class AbbProgram:
         except BadLine:
             return encode(0, Code.ERROR, str(int(Fault.CHECKSUM)), "checksum")
         self._heard_s = self._now()
-        if self._cached is not None and self._cached[0] == data and line.word != Verb.HELLO:
+        if line.word == Verb.HELLO:
+            self._cached = None  # a new conversation begins
+        if self._cached is not None and self._cached[0] == data:
             return self._cached[1]
         try:
-            if self._cached is not None and self._cached[0][:4] == data[:4] and line.word != Verb.HELLO:
+            if self._cached is not None and self._cached[0][:4] == data[:4]:
                 raise _No(Fault.NUMBER)
             reply = encode(line.number, ANSWERS[Verb(line.word)], *self._do(line))
         except _No as no:
@@ -265,12 +268,10 @@ class AbbProgram:
 
     def use(self, **changes: str) -> None:
         """Another identity."""
-        self.identity = replace(self.identity, **changes)  # type: ignore[arg-type]
+        self.identity = replace(self.identity, **changes)
 
 
 def quaternion_wxyz(rotation: FloatArray) -> FloatArray:
     """(4,) of a rotation matrix, w not negative."""
-    from scipy.spatial.transform import Rotation
-
     x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
     return np.array([w, x, y, z])
