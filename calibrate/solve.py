@@ -21,6 +21,8 @@ from calibrate.clouds import Solution, solve_clouds
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot, gather_observations
 from calibrate.plausibility import check_reported_poses
+from calibrate.plausibility_closure import check_closure
+from calibrate.plausibility_scans import check_units
 from calibrate.problem import Priors, Problem, State
 from calibrate.report_figures import make_result
 from calibrate.result import Calibration
@@ -97,7 +99,9 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
     notes = check_reported_poses(sessions, model)
     observations = gather_observations(sessions, cell=cell, model=model)
     if not observations.shots:
+        check_units(sessions, cell)
         raise _nothing_to_use(sessions, observations)
+    check_closure(sessions, observations, model)
     solved, compared = solve_observations(observations, cell, model, settings)
     return make_result(
         solved,

@@ -1,0 +1,125 @@
+"""Do scans and poses belong together? Where they do not, the likely mistakes are tried, and the one that explains it is named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.observations import Observations, SphereShot
+from calibrate.plausibility_causes import Cause, Recorded, causes, shifts
+from calibrate.start_closure import LEAST_SHOTS, Closure, fit_closure
+from drivers.errors import DataError
+from drivers.files.session import Session
+from drivers.kinematics.mdh import RobotModel
+
+CLOSES_MM = 3.0
+"""A nominal robot leaves less than this, in sigma of one component; beyond it mistakes are tried, at no risk for a bad robot."""
+_EXPLAINS = 5.0
+_PLAUSIBLE_MM = 15.0
+_HOPELESS_MM = 30.0
+_AS_GOOD = 1.2
+_MOST_TRIED_SHOTS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A mistake and what is left when it is undone."""
+
+    cause: Cause
+    spread_mm: float
+
+
+def check_closure(sessions: Sequence[Session], observations: Observations, model: RobotModel | None) -> None:
+    """Check that one hand-eye transform brings the shots of every sphere to one place.
+
+    Raises:
+        DataError: it does not, and a mistake explains why: undone, the spread is five times smaller. Or nothing brings
+            the shots within some centimetres; the error then says what was tried.
+    """
+    data = recorded(observations.shots, model)
+    if len(data.sphere) < LEAST_SHOTS:
+        return
+    closure = close(data)
+    spread_mm = float(closure.spread_mm[0])
+    if spread_mm <= CLOSES_MM:
+        return
+    tried = try_causes(data)
+    best = min(tried, key=lambda trial: trial.spread_mm)
+    file = sessions[0].folder / "shots.jsonl" if sessions else None
+    if best.spread_mm <= min(spread_mm / _EXPLAINS, _PLAUSIBLE_MM):
+        equal = [trial for trial in tried if trial.spread_mm <= _AS_GOOD * best.spread_mm]
+        raise DataError(_explained(spread_mm, equal), file=file, remedy=equal[0].cause.remedy)
+    if spread_mm > _HOPELESS_MM:
+        raise DataError(
+            f"no hand-eye transform brings the shots of a sphere to one place (they stay {spread_mm:.0f} mm apart), and no single "
+            f"mistake explains it: {len(tried)} were tried ({_kinds(data)}), the best leaves {best.spread_mm:.0f} mm",
+            file=file,
+            remedy="Check that every scan has the pose at which it was taken, the robot model, and that the spheres stood still.",
+        )
+
+
+def recorded(shots: Sequence[SphereShot], model: RobotModel | None) -> Recorded:
+    """The shots with a centre, of spheres seen often enough to contradict a wrong pose."""
+    names = [shot.sphere for shot in shots]
+    useful = [shot for shot in shots if shot.centre_in_camera_mm is not None and names.count(shot.sphere) >= 3]
+    spheres, sessions = sorted({s.sphere for s in useful}), sorted({s.session for s in useful})
+    with_joints = bool(useful) and model is not None and all(shot.joints_rad is not None for shot in useful)
+    return Recorded(
+        model=model if with_joints else None,
+        joints_rad=np.array([s.joints_rad for s in useful], dtype=np.float64) if with_joints else None,
+        base_from_flange=np.array([s.base_from_flange for s in useful]).reshape(-1, 4, 4),
+        centres_in_camera_mm=np.array([s.centre_in_camera_mm for s in useful], dtype=np.float64).reshape(-1, 3),
+        sphere=np.array([spheres.index(s.sphere) for s in useful], dtype=np.int64),
+        session=np.array([sessions.index(s.session) for s in useful], dtype=np.int64),
+        index=np.array([s.index for s in useful], dtype=np.int64),
+    )
+
+
+def close(data: Recorded) -> Closure:
+    """The common hand-eye transform of some shots as they are."""
+    return fit_closure(data.base_from_flange[None], data.centres_in_camera_mm[None], data.sphere)
+
+
+def try_causes(data: Recorded) -> list[Trial]:
+    """Every likely mistake and the spread that is left when it is undone, plain mistakes first."""
+    moved = [(cause, cause.undo(data)) for cause in shifts()]
+    enough = max(LEAST_SHOTS, len(data.sphere) // 2)
+    moved = [(cause, changed) for cause, changed in moved if len(changed.sphere) >= enough]
+    thin = thinned(data, _MOST_TRIED_SHOTS)
+    return _trials(moved) + _trials([(cause, cause.undo(thin)) for cause in causes(data)])
+
+
+def _trials(changes: Sequence[tuple[Cause, Recorded]]) -> list[Trial]:
+    if not changes:
+        return []
+    n_shots = min(_MOST_TRIED_SHOTS, *(len(changed.sphere) for _, changed in changes))
+    parts = [thinned(changed, n_shots) for _, changed in changes]
+    closure = fit_closure(
+        np.array([part.base_from_flange for part in parts]),
+        np.array([part.centres_in_camera_mm for part in parts]),
+        np.array([part.sphere for part in parts]),
+    )
+    return [Trial(cause, float(spread)) for (cause, _), spread in zip(changes, closure.spread_mm, strict=True)]
+
+
+def thinned(data: Recorded, n_shots: int) -> Recorded:
+    """So many shots, evenly from all."""
+    chosen = np.linspace(0, len(data.sphere) - 1, min(len(data.sphere), n_shots)).astype(np.int64)
+    return data.part(chosen)
+
+
+def _explained(spread_mm: float, equal: Sequence[Trial]) -> str:
+    others = [trial.cause.name for trial in equal[1:3]]
+    same = f" (or, which comes to the same: {'; '.join(others)})" if others else ""
+    return (
+        f"scans and poses do not belong together: the shots of a sphere stay {spread_mm:.1f} mm apart; "
+        f"most likely {equal[0].cause.name}{same}: with that undone they agree to {equal[0].spread_mm:.2f} mm"
+    )
+
+
+def _kinds(data: Recorded) -> str:
+    if data.joints_rad is None:
+        return "units, inverse and transposed poses, conventions of angles and quaternions, mirrored scans, shifted or reversed lists"
+    return "degrees, order, signs and zeros of the axes, coupling, other robot models, units and mirrored scans, shifted or reversed lists"
