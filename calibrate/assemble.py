@@ -31,7 +31,7 @@ class Assembled:
         """The same problem on some of its shots (indices); every sphere stays."""
         problem = subset(self.problem, keep)
         if camera_error is not None:
-            problem = replace(problem, camera_error=camera_error, basis=camera_error.basis(problem.points_in_camera_mm))
+            problem = replace(problem, camera_error=camera_error)
         return Assembled(problem, tuple(self.shots[i] for i in keep), self.sphere_names)
 
 
@@ -61,7 +61,6 @@ def assemble(shots: Sequence[SphereShot], *, cell: Cell, model: RobotModel | Non
         points_in_camera_mm=points,
         starts=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         camera_error=camera_error,
-        basis=camera_error.basis(points),
         radius_mm=np.array([cell.spheres[name].radius_mm for name in names]),
         radius_sigma_mm=np.array([max(cell.spheres[name].radius_standard_uncertainty_mm, _SMALLEST_RADIUS_SIGMA_MM) for name in names]),
         lengths=tuple(
@@ -91,7 +90,6 @@ def subset(problem: Problem, keep: NDArray[np.int64]) -> Problem:
         sphere=problem.sphere[keep],
         points_in_camera_mm=problem.points_in_camera_mm[rows],
         starts=np.concatenate([[0], np.cumsum([len(p) for p in pieces])]).astype(np.int64),
-        basis=problem.basis[rows],
     )
 
 

@@ -119,7 +119,7 @@ class PillowError:
 
     @property
     def polynomials(self) -> Polynomials:
-        """z r^(2i) by the binomial theorem."""
+        """Each term z r^(2i) by the binomial theorem."""
         powers = range(1, self.n_terms + 1)
         terms = [(2, [(float(comb(i, j)), (2 * j, 0, 2 * (i - j) + 1)) for j in range(i + 1)]) for i in powers]
         return monomials(terms, self.sight_crossing_mm, (PILLOW_SCALE_MM,) * 3)

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from calibrate import normal
 from calibrate.assemble import subset, without_pose_noise
-from calibrate.clouds import POINT_CUTOFF_SIGMAS, Solution, patch_sums, shot_moments
+from calibrate.clouds import Solution
 from calibrate.normal import NoiseModel
 from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
+from calibrate.sums import POINT_CUTOFF_SIGMAS, patch_sums, shot_moments
 from calibrate.validation import Prediction, cross_validate
 from calibrate.variance import estimate_point_noise, estimate_pose_noise
 from drivers.errors import DataError, SettingsError
@@ -184,7 +185,7 @@ def _solve_on(
     """Gauss-Newton on centres alone; while the noise is estimated the last digits are left to a later round."""
     weight = noise.point_weight(fits.counts[:, 2])
     step_mm = np.inf
-    for steps in range(_MAX_STEPS):
+    for _ in range(_MAX_STEPS):
         geometry = linearise_geometry(problem, state)
         moments = fits.moments(problem, state, geometry)
         linearised = normal.linearise(problem, state, geometry, moments, weight)
@@ -197,7 +198,7 @@ def _solve_on(
         step, noise_step = normal.solve_step(linearised, reduced)
         state = state.moved(problem.layout, step, noise_step)
         step_mm = float(np.abs(geometry.columns[:, :3] @ step).max())
-    return Solution(problem, state, noise, linearised, reduced, geometry, moments, fits.point_rms_mm, steps)
+    return Solution(problem, state, noise, linearised, reduced, geometry, moments, fits.point_rms_mm, 0)
 
 
 def _settled(before: NoiseModel, after: NoiseModel) -> bool:

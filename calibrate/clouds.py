@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate import normal
+from calibrate.external import ExternalRows, estimate_shared_noise, external_rows, joined
 from calibrate.normal import Linearised, NoiseModel, Reduced
-from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
-from calibrate.variance import estimate_point_noise, estimate_pose_noise
+from calibrate.problem import Geometry, Problem, State, linearise_geometry
+from calibrate.sums import ShotSums, shot_sums
+from calibrate.variance import estimate_incidence, estimate_point_noise, estimate_pose_noise, estimate_range_growth
 from drivers.errors import DataError
 from drivers.kinematics.se3 import FloatArray
 
-POINT_CUTOFF_SIGMAS = 5.0
-"""Geman-McClure cutoff in standard deviations: a clean point keeps 92 % of its weight on average."""
-_LAST_ESTIMATE = 7
-"""Passes in which the noise model is estimated anew; later ones hold it, so that the descent can end."""
+_FIRST_ESTIMATES, _LATER_ESTIMATES = 6, 3
+"""Passes in which the noise model is estimated anew, from a rough start and from a good one; later ones hold it."""
 _FIRST_SWEEPS = 4
-_STEP_TOLERANCE_MM = 1e-8
+_STEP_TOLERANCE_MM = 1e-7
 _STALL_TOLERANCE_MM = 1e-5
 _PATIENCE, _LAST_TOLERANCE_MM = 25, 1e-3
 """A point that changes sides between two passes can keep a solve from its last digits: a micrometre is then enough."""
-_REBASE_TOLERANCE_MM = 1e-5
+_AHEAD_POINTS = 700
+"""Shots of many more points are first solved on about so many of each: most passes then cost next to nothing."""
+_AHEAD_TOLERANCE_MM = 1e-4
+_SLOWEST_RATE = 0.02
+"""Step over the step before that is counted on where less was seen."""
+_NEAR_MM = 0.05
+"""Steps below which the robust loss is curved upwards nearly everywhere: Newton steps are then safe."""
 _MAX_PASSES = 40
 
 
@@ -32,7 +38,6 @@ class Solution:
     """Where the solve ended, and what the data say about it."""
 
     problem: Problem
-    """With the camera basis of the denoised points."""
     state: State
     noise: NoiseModel
     linearised: Linearised
@@ -72,91 +77,86 @@ def solve_clouds(
 ) -> Solution:
     """Minimise the whole-cloud cost from a start that is good to some millimetres.
 
-    Without `estimate_noise` the noise model and the camera basis are taken as given.
+    Without `estimate_noise` the noise model is taken as given.
 
     Raises DataError when the passes do not settle, which means that data and model do not belong together.
     """
-    state, step_mm, settled = start, np.inf, False
-    cutoff = np.inf if estimate_noise else POINT_CUTOFF_SIGMAS * float(np.hypot(noise.point_mm, noise.form_mm))
-    n_points = np.diff(problem.starts).astype(np.float64)
+    n_estimates = _FIRST_ESTIMATES if estimate_noise else 0
+    if len(problem.points_in_camera_mm) <= 2 * _AHEAD_POINTS * problem.n_shots:
+        return _descend(problem, start, noise, n_estimates, tolerance_mm)
+    ahead = _descend(thinned(problem, _AHEAD_POINTS), start, noise, n_estimates, _AHEAD_TOLERANCE_MM)
+    return _descend(problem, ahead.state, ahead.noise, min(n_estimates, _LATER_ESTIMATES), tolerance_mm)
+
+
+def thinned(problem: Problem, n_points: int) -> Problem:
+    """The problem with about so many points a shot (up to twice as many), evenly through it."""
+    pieces = [np.arange(a, b, max(1, (b - a) // n_points)) for a, b in itertools.pairwise(problem.starts)]
+    starts = np.concatenate([[0], np.cumsum([len(piece) for piece in pieces])]).astype(np.int64)
+    return replace(problem, points_in_camera_mm=problem.points_in_camera_mm[np.concatenate(pieces)], starts=starts)
+
+
+def _descend(problem: Problem, state: State, noise: NoiseModel, n_estimates: int, tolerance_mm: float) -> Solution:
+    """Gauss-Newton, Newton in the robust loss; the noise model is estimated in the first passes and held afterwards."""
+    rough, step_mm = n_estimates == _FIRST_ESTIMATES, np.inf
     for passes in range(1, _MAX_PASSES + 1):
-        geometry = linearise_geometry(problem, state)
-        if estimate_noise and passes > 1 and step_mm > _REBASE_TOLERANCE_MM:
-            problem = rebased(problem, state, geometry)
-        estimating = estimate_noise and passes <= _LAST_ESTIMATE
+        geometry, rows = linearise_geometry(problem, state), external_rows(problem, state)
+        estimating, first = passes <= n_estimates, rough and passes == 1
+        sums = shot_sums(problem, state, geometry, None if first else noise, patches=estimating)
         if estimating:
-            noise = estimate_point_noise(patch_sums(problem, state, geometry, cutoff), noise)
-            cutoff = POINT_CUTOFF_SIGMAS * np.hypot(noise.point_mm, noise.form_mm)
-        moments, counts = shot_moments(problem, state, geometry, cutoff)
-        linearised = normal.linearise(problem, state, geometry, moments, noise.point_weight(n_points))
-        if estimating and passes > 1:
-            noise = estimate_pose_noise(linearised, noise, sweeps=_FIRST_SWEEPS if passes == 2 else 1)
-        reduced = normal.reduce(linearised, noise.pose_precision)
-        if settled:
-            rms = np.sqrt(counts[:, 1] / counts[:, 2])
-            return Solution(problem, state, noise, linearised, reduced, geometry, moments, rms, passes)
-        step, noise_step = normal.solve_step(linearised, reduced)
+            noise = _estimate_noise(problem, state, geometry, sums, rows, noise, sweeps=0 if first else _FIRST_SWEEPS if passes == 2 else 1)
+        near = step_mm < _NEAR_MM
+        curved = _sums_of_all(problem, state, geometry, sums, sums.curved_moments if near else sums.moments, rows, noise)
+        step, noise_step = normal.solve_step(curved, normal.reduce(curved, noise.pose_precision))
+        previous_mm, step_mm = step_mm, _size_mm(geometry, rows, step)
+        if not estimating and _settled(step_mm, previous_mm, passes, tolerance_mm):
+            linearised = _sums_of_all(problem, state, geometry, sums, sums.moments, rows, noise)
+            reduced = normal.reduce(linearised, noise.pose_precision)
+            state = state.moved(problem.layout, step, noise_step)
+            return Solution(problem, state, noise, linearised, reduced, geometry, sums.moments, sums.point_rms_mm, passes)
         state = state.moved(problem.layout, step, noise_step)
-        previous_mm, step_mm = step_mm, _size_mm(problem, geometry, step)
-        # rounding ends the descent of nearly noise-free data some digits above the tolerance
-        stalled = step_mm < (_STALL_TOLERANCE_MM if passes < _PATIENCE else _LAST_TOLERANCE_MM) and step_mm > 0.3 * previous_mm
-        settled = (passes > 2 or not estimate_noise) and (step_mm < tolerance_mm or stalled)
     raise DataError(
         f"the solve did not settle in {_MAX_PASSES} passes (last step {step_mm:.2g} mm)",
         remedy="Check that the robot model, the spheres and the scans belong together; `spherecal centres` shows each shot.",
     )
 
 
-def rebased(problem: Problem, state: State, geometry: Geometry) -> Problem:
-    """The problem with the camera basis taken where the points would be without their noise.
-
-    Taken at the noisy points it correlates with their residuals (errors in variables): 0.08 mm of depth noise then cost
-    0.015 mm of bias on the paper's cell; with the basis of the denoised points none was seen.
-    """
-    from calibrate import moments_kernels
-
-    if not problem.layout.n_camera:
-        return problem
-    points = np.zeros_like(problem.points_in_camera_mm)
-    moments_kernels.denoised_points(*_kernel_arguments(problem, state, geometry), points)
-    return replace(problem, basis=problem.camera_error.basis(points))
+def _settled(step_mm: float, previous_mm: float, passes: int, tolerance_mm: float) -> bool:
+    """Whether all steps to come are within the tolerance, judged by how fast they shrink."""
+    rate = max(step_mm / previous_mm, _SLOWEST_RATE) if previous_mm else _SLOWEST_RATE
+    if rate < 1.0 and step_mm < _LAST_TOLERANCE_MM and step_mm * rate / (1.0 - rate) < tolerance_mm:
+        return True
+    # rounding ends the descent of nearly noise-free data some digits above the tolerance
+    return step_mm < (_STALL_TOLERANCE_MM if passes < _PATIENCE else _LAST_TOLERANCE_MM) and step_mm > 0.3 * previous_mm
 
 
-def shot_moments(problem: Problem, state: State, geometry: Geometry, cutoff_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Moments (m, v, v) of every shot and its counts (m, 3): sum of weights, sum of r², points."""
-    from calibrate import moments_kernels
-
-    size = problem.layout.n_camera + 5
-    moments, counts = np.zeros((problem.n_shots, size, size)), np.zeros((problem.n_shots, 3))
-    moments_kernels.shot_moments(*_kernel_arguments(problem, state, geometry), cutoff_mm, moments, counts)
-    return moments, counts
+def _sums_of_all(
+    problem: Problem, state: State, geometry: Geometry, sums: ShotSums, moments: FloatArray, rows: ExternalRows | None, noise: NoiseModel
+) -> Linearised:
+    linearised = normal.linearise(problem, state, geometry, moments, sums.weight(noise))
+    return linearised if rows is None else joined(linearised, rows, noise)
 
 
-def patch_sums(problem: Problem, state: State, geometry: Geometry, cutoff_mm: float) -> FloatArray:
-    """(m, 12, 3) numbers, sums and sums of squares of the residuals by patch of each shot."""
-    from calibrate import moments_kernels
-
-    sums = np.zeros((problem.n_shots, normal.PATCHES, 3))
-    moments_kernels.patch_sums(*_kernel_arguments(problem, state, geometry), cutoff_mm, sums)
-    return sums
-
-
-_KernelArguments = tuple[FloatArray, FloatArray, NDArray[np.int64], FloatArray, NDArray[np.int64], FloatArray, FloatArray, bool]
-
-
-def _kernel_arguments(problem: Problem, state: State, geometry: Geometry) -> _KernelArguments:
-    return (
-        problem.points_in_camera_mm,
-        problem.basis,
-        problem.camera_error.axis,
-        state.camera_mm,
-        problem.starts,
-        geometry.centre_in_camera_mm,
-        expected_radius_mm(problem, state),
-        problem.along_sight,
-    )
+def _estimate_noise(
+    problem: Problem, state: State, geometry: Geometry, sums: ShotSums, rows: ExternalRows | None, noise: NoiseModel, *, sweeps: int
+) -> NoiseModel:
+    """Points first, then (in so many sweeps) poses."""
+    if problem.n_shots:
+        noise = estimate_point_noise(sums.patches, noise)
+        if problem.along_sight and sweeps:
+            noise = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.bands, noise))
+    if not sweeps:
+        return noise
+    spheres = normal.linearise(problem, state, geometry, sums.moments, sums.weight(noise))
+    return _estimate_pose_noise(spheres, rows, noise, sweeps=sweeps)
 
 
-def _size_mm(problem: Problem, geometry: Geometry, step: FloatArray) -> float:
-    """Largest motion of any expected centre that a step causes: gauge directions do not count."""
-    return float(np.abs(geometry.columns[:, :3] @ step).max())
+def _estimate_pose_noise(spheres: Linearised, rows: ExternalRows | None, noise: NoiseModel, *, sweeps: int) -> NoiseModel:
+    if rows is None:
+        return estimate_pose_noise(spheres, noise, sweeps=sweeps)
+    return estimate_shared_noise(spheres, rows, noise, sweeps=sweeps)
+
+
+def _size_mm(geometry: Geometry, rows: ExternalRows | None, step: FloatArray) -> float:
+    """Largest motion of any expected centre or external point that a step causes: gauge directions do not count."""
+    motion_mm = [geometry.columns[:, :3] @ step] + ([] if rows is None else [rows.columns @ step])
+    return max(float(np.abs(part).max(initial=0.0)) for part in motion_mm)

@@ -85,7 +85,6 @@ class Scene:
             points_in_camera_mm=np.zeros((0, 3)),
             starts=np.zeros(len(joints_rad) + 1, dtype=np.int64),
             camera_error=self.camera_error,
-            basis=np.zeros((0, len(self.camera_error.axis))),
             radius_mm=self.radius_mm,
             radius_sigma_mm=self.radius_sigma_mm,
             lengths=self.lengths,

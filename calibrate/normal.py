@@ -12,6 +12,7 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _HELD_RAD = 1e-12
+_HELD_UP = 1e-12
 PATCHES = 12
 """Independent patches that a shot's form error is counted as."""
 
@@ -28,15 +29,28 @@ class NoiseModel:
     """s_r: rotation of the flange per scan, each axis."""
     form_mm: float = 0.0
     """What the model leaves of a sphere's shape, the same over a patch: more points do not average it out."""
+    external_mm: float = 0.0
+    """Random noise of an external point on each axis; zero where there was none to estimate it from."""
+    flat: float = 1.0
+    """A point's variance is point_mm² times flat + steep cos², at an angle of incidence; 1 on average."""
+    steep: float = 0.0
+    range_power: float = 0.0
+    """Noise grows with this power of the range, point_mm being that at `range_mm`."""
+    range_mm: float = 350.0
 
     @property
     def pose_precision(self) -> FloatArray:
         """(6,) inverse variances of a nuisance twist."""
         return np.array([self.pose_mm**-2] * 3 + [self.pose_rad**-2] * 3)
 
-    def point_weight(self, n_points: FloatArray) -> FloatArray:
-        """(m,) weight in mm^-2 of one point in shots of so many points: noise, and form error by patches."""
-        return np.asarray(1.0 / (self.point_mm**2 + n_points / PATCHES * self.form_mm**2))
+    def point_sigma_mm(self, range_mm: FloatArray) -> FloatArray:
+        """(m,) noise of a point of average incidence at some ranges."""
+        return np.asarray(self.point_mm * (range_mm / self.range_mm) ** self.range_power)
+
+    def point_weight(self, n_points: FloatArray, range_mm: FloatArray | None = None) -> FloatArray:
+        """(m,) weight in mm^-2 of one point in shots of so many points: noise at their range, and form error by patches."""
+        sigma_mm = self.point_mm if range_mm is None else self.point_sigma_mm(range_mm)
+        return np.asarray(1.0 / (sigma_mm**2 + n_points / PATCHES * self.form_mm**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,11 +175,11 @@ def marginal_cost(linearised: Linearised, pose_precision: FloatArray) -> float:
     reduced = reduce(linearised, pose_precision)
     diagonal = np.diagonal(reduced.hessian)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    values, vectors = np.linalg.eigh(reduced.hessian * scale[:, None] * scale)
-    keep = values > 1e-13 * values[-1]
-    projected = (vectors[:, keep].T @ (scale * reduced.gradient)) ** 2 / values[keep]
-    log_det = float(np.log(values[keep]).sum() - 2 * np.log(scale).sum())
-    return reduced.log_determinant + log_det + reduced.cost - float(projected.sum())
+    # the last term keeps directions that nothing determines out of the comparison: they add a constant
+    scaled = reduced.hessian * scale[:, None] * scale + _HELD_UP * np.eye(len(scale))
+    right = scale * reduced.gradient
+    log_det = float(np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum())
+    return reduced.log_determinant + log_det + reduced.cost - float(right @ np.linalg.solve(scaled, right))
 
 
 def _sum_by_scan(per_shot: FloatArray, scan: NDArray[np.int64], n_scans: int) -> FloatArray:

@@ -4,7 +4,8 @@ Residual of point i of shot j on sphere s: `|W_ij + e_j - c_s| - (R_s + dR + dR_
 e_j the displacement that the pose noise of the shot's scan causes at the sphere.
 
 Unknowns, in this order: link twists (6 n), hand-eye (6), camera coefficients (k), deflection terms (K), the shared radius offset dR (1), a
-radius deviation per sphere within its certificate (S), sphere centres (3 S). The pose noise is a nuisance twist per scan,
+radius deviation per sphere within its certificate (S), sphere centres (3 S), and for external points (see `calibrate.external`) frames (6 F) and
+targets (3 T). The pose noise is a nuisance twist per scan,
 `(t mm, w rad)` about the flange origin in base axes, with prior `diag(s_t² I, s_r² I)`: at the centre it displaces by
 `t + w x (c - f)`, which is METHOD.md's N_j = s_t² I + s_r² hat(l) hat(l)', and two spheres in one scan share it.
 """
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from calibrate.camera_error import CameraError
 from calibrate.datum import link_columns, term_columns, twist_columns
+from calibrate.external_points import ExternalPoints
 from calibrate.robot_terms import RobotTerm
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
@@ -73,8 +75,6 @@ class Problem:
     starts: IntArray
     """(m + 1,)."""
     camera_error: CameraError
-    basis: FloatArray
-    """(N, k) of the camera error model."""
     radius_mm: FloatArray
     """(S,) certified."""
     radius_sigma_mm: FloatArray
@@ -91,6 +91,8 @@ class Problem:
     """(4, 4) the start's hand-eye transform: a far and weak hold where the shots leave the camera's orientation open."""
     along_sight: bool = True
     """Whether residuals run along the line of sight from the camera's origin (area cameras)."""
+    external: ExternalPoints | None = None
+    """Points of the flange that a laser tracker saw."""
 
     @property
     def n_shots(self) -> int:
@@ -99,14 +101,16 @@ class Problem:
 
     @property
     def n_scans(self) -> int:
-        """Number of scans G."""
-        return int(self.scan.max()) + 1 if self.n_shots else 0
+        """Number of scans G, each with its own pose noise; stops at which external points were seen come last."""
+        n_stops = 0 if self.external is None else self.external.n_stops
+        return (int(self.scan.max()) + 1 if self.n_shots else 0) + n_stops
 
     @property
     def layout(self) -> Layout:
         """Where each unknown sits."""
         n_links = 0 if self.joints_rad is None else self.joints_rad.shape[1]
-        return Layout(n_links, len(self.camera_error.axis), len(self.terms), len(self.radius_mm))
+        n_references, n_targets = (0, 0) if self.external is None else (len(self.external.references), len(self.external.targets))
+        return Layout(n_links, len(self.camera_error.axis), len(self.terms), len(self.radius_mm), n_references, n_targets)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +121,8 @@ class Layout:
     n_camera: int
     n_terms: int
     n_spheres: int
+    n_references: int = 0
+    n_targets: int = 0
 
     @property
     def links(self) -> slice:
@@ -154,9 +160,19 @@ class Layout:
         return slice(self.sphere_radius.stop, self.sphere_radius.stop + 3 * self.n_spheres)
 
     @property
+    def references(self) -> slice:
+        """Frames of external points."""
+        return slice(self.centres.stop, self.centres.stop + 6 * self.n_references)
+
+    @property
+    def targets(self) -> slice:
+        """Targets of external points."""
+        return slice(self.references.stop, self.references.stop + 3 * self.n_targets)
+
+    @property
     def size(self) -> int:
         """Number of unknowns."""
-        return int(self.centres.stop)
+        return int(self.targets.stop)
 
     @property
     def n_geometric(self) -> int:
@@ -182,6 +198,10 @@ class State:
     """(S, 3)."""
     pose_noise: FloatArray
     """(G, 6) nuisance twists (t mm, w rad) about the flange origin, base axes."""
+    base_from_reference: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """(F, 4, 4) frames of external points."""
+    target_in_flange_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(T, 3) what external points are seen of."""
 
     def moved(self, layout: Layout, step: FloatArray, noise_step: FloatArray) -> State:
         """The state after a Gauss-Newton step (size,) and nuisance steps (G, 6)."""
@@ -194,6 +214,8 @@ class State:
             sphere_radius_deviation_mm=self.sphere_radius_deviation_mm + step[layout.sphere_radius],
             centres_in_base_mm=self.centres_in_base_mm + step[layout.centres].reshape(-1, 3),
             pose_noise=self.pose_noise + noise_step,
+            base_from_reference=se3.exp(step[layout.references].reshape(-1, 6)) @ self.base_from_reference,
+            target_in_flange_mm=self.target_in_flange_mm + step[layout.targets].reshape(-1, 3),
         )
 
 
@@ -240,12 +262,13 @@ def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None
             motion[:, :, layout.terms] = term_columns(state.link_twists, frames, problem.load, moving_point)
     motion[:, :, layout.hand_eye] = twist_columns(base_from_flange, moving_point)
     rows = np.arange(problem.n_shots)
+    first = layout.centres.start
     for axis in range(3):
-        motion[rows, axis, layout.centres.start + 3 * problem.sphere + axis] -= 1.0
+        motion[rows, axis, first + 3 * problem.sphere + axis] -= 1.0
     columns = np.zeros((problem.n_shots, layout.n_camera + 4, layout.size))
     columns[:, :3] = camera_from_base_rotation @ motion
-    for k in range(layout.n_camera):
-        columns[:, 3 + k, layout.camera.start + k] = 1.0
+    k = np.arange(layout.n_camera)
+    columns[:, 3 + k, layout.camera.start + k] = 1.0
     columns[:, -1, layout.radius_offset.start] = 1.0
     columns[rows, -1, layout.sphere_radius.start + problem.sphere] = 1.0
     return Geometry(

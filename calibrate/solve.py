@@ -17,7 +17,10 @@ from acquire.check import check_session
 from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
 from calibrate.centres import cross_validate_centres, solve_centres
-from calibrate.clouds import Solution, solve_clouds
+from calibrate.clouds import Solution, solve_clouds, thinned
+from calibrate.external_points import ExternalShot
+from calibrate.external_solve import held_out_errors, joined_by_external, solve_robot_alone, without_spoiled
+from calibrate.external_verdict import robot_alone_result
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot, gather_observations
 from calibrate.plausibility import check_reported_poses
@@ -32,6 +35,7 @@ from calibrate.validation import Prediction, cross_validate, predict, shot_centr
 from drivers.errors import DataError, SettingsError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.se3 import FloatArray
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_SIGHT_CROSSING_MM = (60.0, 0.0, 500.0)
@@ -65,6 +69,8 @@ class Solved:
     solution: Solution
     held_out: Prediction
     rejected: tuple[RejectedShot, ...]
+    external_held_out_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(E, 3) error of every external point against a solve without it; see `held_out_errors`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +104,8 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
     cell, model = cell_of_sessions(sessions)
     notes = check_reported_poses(sessions, model)
     observations = gather_observations(sessions, cell=cell, model=model)
+    if model is not None and observations.external and not _show_spheres(sessions):
+        return _calibrate_robot_alone(sessions, observations, cell, model, settings, notes, began)
     if not observations.shots:
         check_units(sessions, cell)
         raise _nothing_to_use(sessions, observations)
@@ -112,10 +120,48 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
         notes=notes,
         compared=compared,
         rejected=observations.rejected + solved.rejected,
-        created_utc=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-        software=f"spherecal {importlib.metadata.version('spherecal')}",
+        created_utc=_now_utc(),
+        software=_software(),
         began=began,
     )
+
+
+def _calibrate_robot_alone(
+    sessions: Sequence[Session],
+    observations: Observations,
+    cell: Cell,
+    model: RobotModel,
+    settings: CalibrationSettings,
+    notes: tuple[str, ...],
+    began: float,
+) -> Calibration:
+    if settings.method != "clouds":
+        message = f"the method {settings.method} works on spheres, and the session holds external reference points alone"
+        raise SettingsError(message, remedy="Use --method clouds.")
+    solved = solve_robot_alone(observations.external, model, settings.priors, cell.flange_from_camera)
+    return robot_alone_result(
+        solved,
+        cell=cell,
+        sessions=sessions,
+        n_shots=observations.n_shots,
+        notes=notes,
+        rejected=observations.rejected + solved.rejected,
+        created_utc=_now_utc(),
+        software=_software(),
+        began=began,
+    )
+
+
+def _show_spheres(sessions: Sequence[Session]) -> bool:
+    return any(shot.sphere is not None and shot.status != "skipped" and not shot.is_reference_point for s in sessions for shot in s.shots)
+
+
+def _now_utc() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def _software() -> str:
+    return f"spherecal {importlib.metadata.version('spherecal')}"
 
 
 def cell_of_sessions(sessions: Sequence[Session]) -> tuple[Cell, RobotModel | None]:
@@ -146,14 +192,20 @@ def solve_observations(
     if settings.method == "stepwise":
         from calibrate.stepwise_sessions import solve_stepwise_sessions
 
-        return solve_stepwise_sessions(observations, cell, model, settings), {}
+        solved = solve_stepwise_sessions(observations, cell, model, settings)
+        return replace(solved, rejected=solved.rejected + tuple(_not_taken(shot, "stepwise") for shot in observations.external)), {}
     solver = _SOLVERS.get(settings.method)
     if solver is None:
         raise SettingsError(f"unknown method {settings.method!r}", remedy=f"Choose {', '.join(_SOLVERS)} or stepwise.")
     models = _candidates(observations, cell, settings)
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
     start, keep, rejected = _start(first, cell)
-    first = replace(first, problem=replace(first.problem, first_flange_from_camera=start.flange_from_camera))
+    problem = replace(first.problem, first_flange_from_camera=start.flange_from_camera)
+    if settings.method == "clouds":
+        problem, start, spoiled = joined_by_external(problem, start, observations.external, start.flange_from_camera)
+    else:
+        spoiled = tuple(_not_taken(shot, settings.method) for shot in observations.external)
+    first, rejected = replace(first, problem=problem), rejected + spoiled
     if len(models) == 1:
         return _solve_and_reject(solver, first, start, keep, rejected), {}
     keep = _kept_after_solve(solver, first, start, keep)
@@ -199,11 +251,13 @@ def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep
         part = everything.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
         far, miss_mm = _unexplained(part, solution)
-        if not far.any():
+        external, spoiled = without_spoiled(solution)
+        if not far.any() and not spoiled:
             break
-        rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))
+        rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far)) + spoiled
         keep, start = keep[~far], solution.state
-    return Solved(part, solution, solver.held_out(solution), rejected)
+        everything = replace(everything, problem=replace(everything.problem, external=external))
+    return Solved(part, solution, solver.held_out(solution), rejected, held_out_errors(solution))
 
 
 def _kept_after_solve(solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -232,14 +286,7 @@ def _unexplained(assembled: Assembled, solution: Solution) -> tuple[NDArray[np.b
 
 def _thinned(assembled: Assembled) -> Assembled:
     """At most some hundred points a shot, evenly through it: enough to compare models."""
-    shots = tuple(
-        replace(s, points_in_camera_mm=s.points_in_camera_mm[:: max(1, len(s.points_in_camera_mm) // _THIN_POINTS)]) for s in assembled.shots
-    )
-    problem = assembled.problem
-    points = np.concatenate([shot.points_in_camera_mm for shot in shots])
-    starts = np.concatenate([[0], np.cumsum([len(s.points_in_camera_mm) for s in shots])]).astype(np.int64)
-    thin = replace(problem, points_in_camera_mm=points, starts=starts, basis=problem.camera_error.basis(points))
-    return Assembled(thin, shots, assembled.sphere_names)
+    return replace(assembled, problem=thinned(assembled.problem, _THIN_POINTS))
 
 
 def _for_model(state: State, camera_error: CameraError) -> State:
@@ -264,6 +311,10 @@ def _simplest_of_the_best(tried: Sequence[Solved]) -> int:
 
 def _held_out_rms(solved: Solved) -> float:
     return float(np.sqrt(squared_errors_mm2(solved.held_out).mean()))
+
+
+def _not_taken(shot: ExternalShot, method: str) -> RejectedShot:
+    return RejectedShot(shot.session, shot.index, f"the method {method} takes no external reference points; --method clouds does")
 
 
 def _too_far(shot: SphereShot, miss_mm: float) -> RejectedShot:

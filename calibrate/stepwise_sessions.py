@@ -16,13 +16,14 @@ from acquire.cell import Cell
 from calibrate import normal
 from calibrate.assemble import Assembled, assemble
 from calibrate.camera_error import CameraError, NoCameraError, PillowError
-from calibrate.clouds import Solution, patch_sums, rebased, shot_moments
+from calibrate.clouds import Solution
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations
 from calibrate.problem import Problem, State, linearise_geometry
 from calibrate.solve import CalibrationSettings, Solved
 from calibrate.start import initial_state, start_from_centres
 from calibrate.stepwise import StepwiseSettings, points_in_base_mm, solve_stepwise, stepwise_data
+from calibrate.sums import patch_sums, shot_moments
 from calibrate.validation import cross_validate
 from calibrate.variance import estimate_point_noise, estimate_pose_noise
 from drivers.errors import SettingsError
@@ -86,7 +87,6 @@ def described_at(problem: Problem, state: State, passes: int) -> Solution:
     n_points = np.diff(problem.starts).astype(np.float64)
     for _ in range(_NOISE_ROUNDS):
         geometry = linearise_geometry(problem, state)
-        problem = rebased(problem, state, geometry)
         noise = estimate_point_noise(patch_sums(problem, state, geometry, np.inf), noise)
         moments, counts = shot_moments(problem, state, geometry, np.inf)
         linearised = normal.linearise(problem, state, geometry, moments, noise.point_weight(n_points))

@@ -127,7 +127,6 @@ def problem_of(cell: StudyCell, joints_rad: FloatArray, clouds_in_camera_mm: Flo
         points_in_camera_mm=points,
         starts=(np.arange(m + 1) * n_points).astype(np.int64),
         camera_error=PILLOW,
-        basis=PILLOW.basis(points),
         radius_mm=np.array([cell.radius_mm]),
         radius_sigma_mm=np.array([0.00025]),
     )

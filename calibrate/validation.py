@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.assemble import subset, without_pose_noise
-from calibrate.clouds import Solution, rebased, shot_moments, solve_clouds
+from calibrate.clouds import Solution, solve_clouds
 from calibrate.problem import Geometry, Problem, State, linearise_geometry
+from calibrate.sums import shot_moments
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
@@ -48,7 +49,6 @@ def predict(problem: Problem, state: State) -> Prediction:
     """Look at the shots of a problem with a state that another set of shots gave."""
     state = without_pose_noise(state, problem.n_scans)
     geometry = linearise_geometry(problem, state)
-    problem = rebased(problem, state, geometry)
     _, counts = shot_moments(problem, state, geometry, np.inf)
     error = np.full((problem.n_shots, 3), np.nan)
     centres = error.copy()

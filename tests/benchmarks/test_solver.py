@@ -7,10 +7,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from calibrate.camera_error import PillowError
-from calibrate.clouds import shot_moments, solve_clouds
+from calibrate.clouds import solve_clouds
 from calibrate.normal import NoiseModel
 from calibrate.problem import Problem, State, linearise_geometry
 from calibrate.start import initial_state
+from calibrate.sums import shot_moments
 from drivers.kinematics import mdh, se3
 from tests.support.synthetic import draw_shot, paper_cell
 from tests.support.timing import best_of, tell
@@ -39,7 +40,6 @@ def reference_problem(n_points: int) -> tuple[Problem, State]:
         points_in_camera_mm=points,
         starts=np.arange(N_SHOTS + 1) * n_points,
         camera_error=camera_error,
-        basis=camera_error.basis(points),
         radius_mm=np.array([cell.radius_mm]),
         radius_sigma_mm=np.array([0.00025]),
     )

@@ -76,9 +76,11 @@ def fixed_radius_centres_in_base_mm(test: Problem, state: State) -> FloatArray:
     centres = geometry.centre_in_camera_mm.copy()
     for j in range(test.n_shots):
         piece = slice(test.starts[j], test.starts[j + 1])
-        corrected = test.points_in_camera_mm[piece].copy()
+        measured = test.points_in_camera_mm[piece]
+        corrected = measured.copy()
+        basis = test.camera_error.basis(measured)
         for k, axis in enumerate(test.camera_error.axis):
-            corrected[:, axis] += state.camera_mm[k] * test.basis[piece, k]
+            corrected[:, axis] += state.camera_mm[k] * basis[:, k]
         for _ in range(8):
             away = corrected - centres[j]
             distance = np.linalg.norm(away, axis=1)

@@ -97,7 +97,6 @@ def solved_length_errors_mm(case: Case, rows: IntArray, rng: np.random.Generator
         blank,
         points_in_camera_mm=flat,
         starts=np.arange(len(joints) + 1) * points.shape[1],
-        basis=scene.camera_error.basis(flat),
         lengths=tuple(lengths),
     )
     start = replace(scene.nominal_state(blank.n_scans), centres_in_base_mm=truth.centres_in_base_mm)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from calibrate.camera_error import CameraError, NoCameraError
+from calibrate.camera_error import CameraError, NoCameraError, correction_in_camera_mm, correction_of_basis
 from calibrate.problem import Geometry, LengthConstraint, Priors, Problem, State, expected_radius_mm
 from calibrate.start import initial_state
 from drivers.kinematics import mdh, se3
@@ -69,7 +69,6 @@ def problem_of(
         points_in_camera_mm=points,
         starts=np.concatenate([[0], np.cumsum([len(shot.points_in_camera_mm) for shot in flat])]).astype(np.int64),
         camera_error=camera,
-        basis=camera.basis(points),
         radius_mm=np.full(len(named), cell.radius_mm),
         radius_sigma_mm=np.full(len(named), 0.00025),
         lengths=tuple(lengths),
@@ -111,14 +110,29 @@ def point_rows(problem: Problem, state: State, geometry: Geometry) -> FloatArray
     The residual runs along the line of sight to where it meets the sphere, projected on the normal there; where it
     misses or grazes, it is radial.
     """
+    basis, (u, residual, _) = _at_denoised(problem, state, geometry)
+    return np.concatenate([u, basis * u[:, problem.camera_error.axis], -np.ones((len(u), 1)), residual[:, None]], axis=1)
+
+
+def cosines(problem: Problem, state: State, geometry: Geometry) -> FloatArray:
+    """(N,) cosine of the incidence of every point's sight on its sphere; zero where its residual is radial."""
+    return _at_denoised(problem, state, geometry)[1][2]
+
+
+def _at_denoised(problem: Problem, state: State, geometry: Geometry) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
+    """Camera terms (N, k) where the points would be without their noise, and the residuals that they leave."""
     shot = np.repeat(np.arange(problem.n_shots), np.diff(problem.starts))
-    measured, radius = problem.points_in_camera_mm, expected_radius_mm(problem, state)[shot]
-    shift = np.zeros_like(measured)
-    for k, axis in enumerate(problem.camera_error.axis):
-        shift[:, axis] += state.camera_mm[k] * problem.basis[:, k]
-    away = measured + shift - geometry.centre_in_camera_mm[shot]
+    measured, radius, centre = problem.points_in_camera_mm, expected_radius_mm(problem, state)[shot], geometry.centre_in_camera_mm[shot]
+    model = problem.camera_error
+    first = measured + correction_in_camera_mm(model, state.camera_mm, measured)
+    basis = model.basis(denoised(measured, *residuals(problem, measured, first - centre, radius)))
+    return basis, residuals(problem, measured, measured + correction_of_basis(model, state.camera_mm, basis) - centre, radius)
+
+
+def residuals(problem: Problem, measured: FloatArray, away: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normals (N, 3), residuals (N,) and cosines of incidence (N,; zero where radial) of points `away` from their sphere's centre."""
     distance = np.linalg.norm(away, axis=1)
-    u, residual = away / distance[:, None], distance - radius
+    u, residual, cosine = away / distance[:, None], distance - radius, np.zeros(len(away))
     if problem.along_sight:
         to_camera = -measured / np.linalg.norm(measured, axis=1, keepdims=True)
         along = (away * to_camera).sum(axis=1)
@@ -128,4 +142,12 @@ def point_rows(problem: Problem, state: State, geometry: Geometry) -> FloatArray
         past = along - depth
         u[hit] = (away - past[:, None] * to_camera)[hit] / radius[hit, None]
         residual[hit] = (past * depth / radius)[hit]
-    return np.concatenate([u, problem.basis * u[:, problem.camera_error.axis], -np.ones((len(u), 1)), residual[:, None]], axis=1)
+        cosine[hit] = (depth / radius)[hit]
+    return u, residual, cosine
+
+
+def denoised(measured: FloatArray, u: FloatArray, residual: FloatArray, cosine: FloatArray) -> FloatArray:
+    """Measured points (N, 3) moved onto their sphere: along the sight where it meets it steeply, else radially."""
+    sight = measured / np.linalg.norm(measured, axis=1, keepdims=True)
+    hit = cosine > 0
+    return np.where(hit[:, None], measured + sight * (residual / np.where(hit, cosine, 1.0))[:, None], measured - residual[:, None] * u)

@@ -10,8 +10,9 @@ import pytest
 from acquire.sphere_fit import fit_fixed_radius
 from calibrate.camera_error import CameraError, NoCameraError, PillowError, camera_error_models
 from calibrate.centres import CentreFits, cross_validate_centres, fit_centres, solve_centres
-from calibrate.clouds import shot_moments, solve_clouds
+from calibrate.clouds import solve_clouds
 from calibrate.problem import Problem, State, expected_radius_mm, linearise_geometry
+from calibrate.sums import shot_moments
 from calibrate.validation import cross_validate
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics import se3
@@ -43,7 +44,8 @@ def test_centres_follow_camera_and_radius_as_refitted_ones_do(bent: tuple[Proble
     problem, state = bent
     fits = fits_at(problem, state)
     for k in range(problem.layout.n_camera + 1):
-        for step, error in ((1e-3, 2e-7), (1e-2, 2e-5)):
+        # the terms are taken at the denoised points, and that these move too is left out: a thousandth of the step
+        for step, error in ((1e-3, 2e-6), (1e-2, 3e-5)):
             unit = np.zeros(problem.layout.n_camera)
             unit[k:] = step if k == problem.layout.n_camera else unit[k:]
             if k < problem.layout.n_camera:
@@ -129,7 +131,7 @@ def test_points_that_are_not_on_the_sphere_weigh_next_to_nothing() -> None:
     test = problem_of(CELL, noise_free(CELL, rng, 20, n_points=100), PillowError())
     rms = []
     for points in (problem.points_in_camera_mm, stray):
-        spoiled = replace(problem, points_in_camera_mm=points, basis=problem.camera_error.basis(points))
+        spoiled = replace(problem, points_in_camera_mm=points)
         rms.append(held_out_rms_mm(test, solve_centres(spoiled, start_of(problem, CELL), FIRST_NOISE).state))
     assert rms[1] < 1.3 * rms[0]
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from calibrate import normal
-from calibrate.clouds import shot_moments
 from calibrate.design import best_next, choose_shots, information_before, information_of, predicted_of_shots
 from calibrate.design_cell import work_box_mm
 from calibrate.design_mismatch import Physics, camera_disturbance, deflection_columns, modelled_covariance_mm2
@@ -17,6 +16,7 @@ from calibrate.design_shots import Expectation, ideal_caps, layout_of, point_wei
 from calibrate.normal import NoiseModel
 from calibrate.problem import linearise_geometry
 from calibrate.robot_terms import arm_terms, load_basis
+from calibrate.sums import shot_moments
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics import mdh, se3
 from tests.support.designing import Case, random_rows, solved_length_errors_mm, volume_case
@@ -41,7 +41,7 @@ def test_information_is_that_of_the_solver_on_the_same_points(case: Case) -> Non
     unit = ideal_caps(scene, joints, sphere).unit
     points = (geometry.centre_in_camera_mm[:, None] + scene.radius_mm[sphere][:, None, None] * unit).reshape(-1, 3)
     starts = np.arange(len(joints) + 1) * unit.shape[1]
-    problem = replace(blank, points_in_camera_mm=points, starts=starts, basis=scene.camera_error.basis(points))
+    problem = replace(blank, points_in_camera_mm=points, starts=starts)
     moments, _ = shot_moments(problem, state, geometry, np.inf)
     linearised = normal.linearise(problem, state, geometry, moments, np.full(len(joints), point_weight(scene)))
     dense = normal.reduce(linearised, scene.expectation.noise.pose_precision).hessian

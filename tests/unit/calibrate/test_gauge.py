@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from calibrate.camera_error import CameraError, NoCameraError, PillowError
-from calibrate.clouds import Solution, shot_moments, solve_clouds
+from calibrate.clouds import Solution, solve_clouds
 from calibrate.identifiability import Identifiability, identifiability_of, parameter_names, parameter_scale
 from calibrate.normal import NoiseModel, linearise, reduce
 from calibrate.problem import Problem, State, linearise_geometry
+from calibrate.sums import shot_moments
 from calibrate.verdict import Evidence, judge
 from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from calibrate.camera_error import CameraError, NoCameraError, PillowError
-from calibrate.clouds import patch_sums, rebased, shot_moments
-from calibrate.problem import Geometry, Problem, State, linearise_geometry
+from calibrate.camera_error import CameraError, NoCameraError, PillowError, PolynomialError
+from calibrate.normal import NoiseModel
+from calibrate.polynomials import Polynomials, monomials
+from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
+from calibrate.sums import POINT_CUTOFF_SIGMAS, patch_sums, shot_moments, shot_sums
 from drivers.kinematics.se3 import FloatArray
-from tests.support.solving import draw_shots, noise_free, point_rows, problem_of, start_of
+from tests.support.solving import cosines, draw_shots, noise_free, point_rows, problem_of, start_of
 from tests.support.synthetic import paper_cell
 
 
@@ -33,11 +35,17 @@ class ThreeAxes:
     def basis(self, points_in_camera_mm: ArrayLike) -> FloatArray:
         return np.asarray(points_in_camera_mm, dtype=np.float64) / 1000.0
 
+    @property
+    def polynomials(self) -> Polynomials:
+        return monomials([(axis, [(1.0, degrees)]) for axis, degrees in enumerate([(1, 0, 0), (0, 1, 0), (0, 0, 1)])], [0.0] * 3, [1000.0] * 3)
+
     def settings(self) -> dict[str, object]:
         return {"model": "three"}
 
 
-MODELS: list[CameraError] = [NoCameraError(), PillowError(), ThreeAxes()]
+FIELD = PolynomialError((0.0, 10.0, 320.0), (60.0, 40.0, 50.0), 3, 2)
+"""Its box leaves part of the points outside."""
+MODELS: list[CameraError] = [NoCameraError(), PillowError(), ThreeAxes(), FIELD]
 
 
 def noisy(camera_error: CameraError, along_sight: bool, seed: int = 0) -> tuple[Problem, State, Geometry]:
@@ -63,7 +71,7 @@ def test_moments_are_the_weighted_sums_over_the_points(camera_error: CameraError
         v = rows[problem.starts[j] : problem.starts[j + 1]]
         weight = (1 + (v[:, -1] / cutoff_mm) ** 2) ** -2.0
         np.testing.assert_allclose(moments[j], (v * weight[:, None]).T @ v, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(counts[j], [weight.sum(), (v[:, -1] ** 2).sum(), len(v)], rtol=1e-9)
+        np.testing.assert_allclose(counts[j, :3], [weight.sum(), (v[:, -1] ** 2).sum(), len(v)], rtol=1e-9)
 
 
 @cases
@@ -71,7 +79,7 @@ def test_the_order_of_points_in_a_shot_changes_nothing(camera_error: CameraError
     problem, state, geometry = noisy(camera_error, along_sight)
     rng = np.random.default_rng(9)
     order = np.concatenate([a + rng.permutation(b - a) for a, b in zip(problem.starts[:-1], problem.starts[1:], strict=True)])
-    shuffled = replace(problem, points_in_camera_mm=problem.points_in_camera_mm[order], basis=problem.basis[order])
+    shuffled = replace(problem, points_in_camera_mm=problem.points_in_camera_mm[order])
     for ours, theirs in zip(shot_moments(problem, state, geometry, 0.5), shot_moments(shuffled, state, geometry, 0.5), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
 
@@ -134,26 +142,60 @@ def test_rays_that_miss_the_sphere_have_the_radial_residual() -> None:
     np.testing.assert_allclose(moments[0, -2, -1], -expected.sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("along_sight", [True, False])
-def test_denoised_points_lie_on_the_sphere_once_corrected(along_sight: bool) -> None:
-    """The basis of ThreeAxes is the point itself, so a rebased problem tells where its denoised points are."""
-    problem, state, geometry = noisy(ThreeAxes(), along_sight)
-    assert np.abs(point_rows(problem, state, geometry)[:, -1]).max() > 0.05
-    clean = rebased(problem, state, geometry).basis * 1000.0
-    sight = problem.points_in_camera_mm / np.linalg.norm(problem.points_in_camera_mm, axis=1, keepdims=True)
-    centre = geometry.centre_in_camera_mm[np.repeat(np.arange(problem.n_shots), np.diff(problem.starts))]
-    # what lies beside the sphere or grazes it is moved radially
-    beside_mm = np.linalg.norm(np.cross(problem.points_in_camera_mm + problem.basis * state.camera_mm - centre, sight), axis=1)
-    steep = beside_mm < 17.0 if along_sight else np.ones(len(clean), dtype=bool)
-    normal = point_rows(problem, state, geometry)[:, :3]
-    assert steep.sum() > 0.8 * len(clean)
-    on_sphere = replace(problem, points_in_camera_mm=clean, basis=problem.basis)
-    np.testing.assert_allclose(point_rows(on_sphere, state, geometry)[steep, -1], 0.0, atol=1e-9)
-    moved = clean - problem.points_in_camera_mm
-    across = np.cross(moved, sight if along_sight else normal)
-    np.testing.assert_allclose(across[steep], 0.0, atol=1e-9)
+@cases
+def test_the_curvature_is_the_derivative_of_the_gradient(camera_error: CameraError, along_sight: bool) -> None:
+    """Sum of the weights of the second derivative: how the sum of weight times residual follows the radius at unit moments."""
+    problem, state, geometry = noisy(camera_error, along_sight)
+    noise, step_mm = NoiseModel(point_mm=0.05, pose_mm=0.01, pose_rad=1e-4), 1e-5
+    sides = [shot_sums(problem, replace(state, radius_offset_mm=state.radius_offset_mm + d), geometry, noise) for d in (-step_mm, step_mm)]
+    slope = (sides[0].moments[:, -2, -1] - sides[1].moments[:, -2, -1]) / (2 * step_mm)
+    if not camera_error.axis.size and not along_sight:
+        expected = shot_sums(problem, state, geometry, noise).counts[:, 3]
+        np.testing.assert_allclose(-slope, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_without_a_camera_model_there_is_nothing_to_rebase() -> None:
-    problem, state, geometry = noisy(NoCameraError(), True)
-    assert rebased(problem, state, geometry) is problem
+def weighted_by(noise: NoiseModel, rows: FloatArray, cosine: FloatArray, range_mm: float) -> FloatArray:
+    variance = noise.flat + noise.steep * cosine**2
+    cutoff = POINT_CUTOFF_SIGMAS * np.hypot(noise.point_mm * (range_mm / noise.range_mm) ** noise.range_power, noise.form_mm)
+    return np.asarray((1 + rows[:, -1] ** 2 / variance / cutoff**2) ** -2.0 / variance)
+
+
+@cases
+def test_points_weigh_by_their_incidence_and_range(camera_error: CameraError, along_sight: bool) -> None:
+    problem, state, geometry = noisy(camera_error, along_sight)
+    noise = NoiseModel(0.1, 0.01, 1e-4, form_mm=0.02, flat=0.4, steep=1.1, range_power=2.0, range_mm=300.0)
+    sums = shot_sums(problem, state, geometry, noise)
+    rows = point_rows(problem, state, geometry)
+    cosine = cosines(problem, state, geometry)
+    for j in range(problem.n_shots):
+        own = slice(problem.starts[j], problem.starts[j + 1])
+        weight = weighted_by(noise, rows[own], cosine[own], float(np.linalg.norm(geometry.centre_in_camera_mm[j])))
+        np.testing.assert_allclose(sums.moments[j], (rows[own] * weight[:, None]).T @ rows[own], rtol=1e-9, atol=1e-9)
+
+
+def test_bands_share_out_the_points_by_incidence() -> None:
+    problem, state, geometry = noisy(PillowError(), True)
+    sums = shot_sums(problem, state, geometry, None, patches=True)
+    rows = point_rows(problem, state, geometry)
+    np.testing.assert_allclose(sums.bands[:, :, 0].sum(axis=1), np.diff(problem.starts))
+    np.testing.assert_allclose(sums.bands[:, :, 2].sum(), (rows[:, -1] ** 2).sum(), rtol=1e-9)
+    mean = sums.bands[..., 1].sum(axis=0) / np.maximum(sums.bands[..., 0].sum(axis=0), 1)
+    filled = sums.bands[..., 0].sum(axis=0) > 0
+    assert (np.diff(mean[filled]) > 0).all()
+    assert ((mean * 6 - np.arange(6))[filled] <= 1.0).all()
+    assert ((mean * 6 - np.arange(6))[filled] >= 0.0).all()
+
+
+def test_threads_change_nothing() -> None:
+    import numba
+
+    problem, state, geometry = noisy(FIELD, True)
+    before = numba.get_num_threads()
+    many = shot_moments(problem, state, geometry, 0.5)
+    try:
+        numba.set_num_threads(1)
+        one = shot_moments(problem, state, geometry, 0.5)
+    finally:
+        numba.set_num_threads(before)
+    for a, b in zip(many, one, strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calibrate.camera_error import PillowError
-from calibrate.clouds import shot_moments
 from calibrate.normal import Linearised, NoiseModel, linearise, marginal_cost, reduce, solve_step, symmetric_inverse, symmetric_solve
 from calibrate.problem import LengthConstraint, Problem, State, linearise_geometry
+from calibrate.sums import shot_moments
 from drivers.kinematics.se3 import FloatArray
 from tests.support.bound import prior_precision
 from tests.support.solving import bent_state, draw_shots, point_rows, problem_of

@@ -98,7 +98,7 @@ def test_a_step_back_undoes_a_step() -> None:
     step = 1e-3 * rng.normal(size=problem.layout.size)
     there = state.moved(problem.layout, step, np.zeros_like(state.pose_noise))
     again = there.moved(problem.layout, -step, np.zeros_like(state.pose_noise))
-    for name in (f.name for f in fields(state) if f.name != "pose_noise"):
+    for name in (f.name for f in fields(state) if f.name != "pose_noise" and np.size(getattr(state, f.name))):
         assert np.abs(np.asarray(getattr(there, name)) - np.asarray(getattr(state, name))).max() > 0
         np.testing.assert_allclose(getattr(again, name), getattr(state, name), atol=1e-12, err_msg=name)
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.clouds import patch_sums, shot_moments
 from calibrate.normal import NoiseModel, linearise
 from calibrate.problem import Problem, State, linearise_geometry
+from calibrate.sums import patch_sums, shot_moments
 from calibrate.variance import estimate_point_noise, estimate_pose_noise
 from drivers.kinematics.se3 import FloatArray
 from tests.support.solving import draw_shots, problem_of, start_of
