@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from acquire.cell import Cell
 from acquire.sphere import SphereFinding, SphereNotFound, SphereSettings, find_arc, find_sphere
+from calibrate.external_points import ExternalShot, external_shots
 from drivers.errors import DataError
 from drivers.files.session import Session, Shot, read_scan
 from drivers.kinematics import mdh, se3
@@ -65,11 +66,13 @@ class Observations:
 
     shots: tuple[SphereShot, ...]
     rejected: tuple[RejectedShot, ...]
+    external: tuple[ExternalShot, ...] = ()
+    """External reference points, which need no scan."""
 
     @property
     def n_shots(self) -> int:
         """Used and rejected."""
-        return len(self.shots) + len(self.rejected)
+        return len(self.shots) + len(self.external) + len(self.rejected)
 
 
 def gather_observations(
@@ -95,6 +98,8 @@ def gather_observations(
     n_metres = 0
     for session in sessions:
         for shot in session.shots:
+            if shot.is_reference_point and shot.status == "failed":
+                rejected.append(RejectedShot(session.digest, shot.index, f"marked failed: {shot.reason or 'no reason given'}"))
             if shot.status == "skipped" or shot.is_reference_point or shot.sphere is None:
                 continue
             try:
@@ -110,7 +115,7 @@ def gather_observations(
             file=sessions[0].folder / "scans",
             remedy="Write the clouds in mm (multiply x, y and z by 1000).",
         )
-    return Observations(tuple(sorted(shots, key=lambda s: s.key)), tuple(rejected))
+    return Observations(tuple(sorted(shots, key=lambda s: s.key)), tuple(rejected), external_shots(sessions))
 
 
 def observe(

@@ -71,7 +71,7 @@ _CAUSES: dict[str, _Attempt] = {
         pose,
     ),
     "the parallelogram coupling theta_3 = q_3 - q_2 is missing from the robot model": lambda model, q, pose: (
-        mdh.base_from_flange(replace(model, coupling=_parallelogram(model.n_joints)), q),
+        mdh.base_from_flange(replace(model, coupling=parallelogram(model.n_joints)), q),
         pose,
     ),
     "poses and axis angles are shifted by one shot": lambda model, q, pose: (mdh.base_from_flange(model, np.roll(q, 1, axis=0)), pose),
@@ -105,7 +105,8 @@ def _scaled(pose: FloatArray, factor: float) -> FloatArray:
     return result
 
 
-def _parallelogram(n: int) -> FloatArray:
+def parallelogram(n: int) -> FloatArray:
+    """(n, n) coupling `theta_3 = q_3 - q_2` of an arm whose upper arm does not turn its forearm."""
     coupling = np.eye(n)
     if n > 2:
         coupling[2, 1] = -1.0

@@ -14,8 +14,11 @@ from acquire.cell import Cell
 from calibrate.assemble import Assembled
 from calibrate.clouds import Solution
 from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.external_result import external_names, external_result
+from calibrate.external_solve import predicted_rms_mm, rms_mm
 from calibrate.identifiability import identifiability_of, parameter_names
 from calibrate.observations import RejectedShot
+from calibrate.problem import Problem
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
@@ -47,13 +50,17 @@ def make_result(
     state = solution.state
     has_joints = problem.model is not None and problem.joints_rad is not None
     datum = controller_datum()
-    if problem.model is not None and problem.joints_rad is not None:
-        datum = nominal_robot_datum(problem.model, state.link_twists, problem.joints_rad)
+    joints, used = _all_joints(problem), problem.n_shots + (0 if problem.external is None else problem.external.n_shots)
+    if problem.model is not None and joints is not None:
+        datum = nominal_robot_datum(problem.model, state.link_twists, joints)
     trained = predict(problem, state)
     line_profile = not problem.along_sight
     held_out_rms = solved.held_out.radial_rms_mm if line_profile else solved.held_out.centre_rms_mm
     predicted_rms = None if line_profile else _predicted_centre_rms(assembled, solution)
     scale = 1.0 if predicted_rms is None else max(1.0, (held_out_rms / predicted_rms) ** 2)
+    external_rms, external_predicted = rms_mm(solved.external_held_out_mm), predicted_rms_mm(solution)
+    if np.isfinite(external_rms):
+        scale = max(scale, (external_rms / external_predicted) ** 2)
     identifiability = identifiability_of(problem, solution)
     names = assembled.sphere_names
     covariance = solution.covariance * scale
@@ -63,11 +70,13 @@ def make_result(
             cross_validated_rms_mm=held_out_rms,
             length_expanded_uncertainty_mm=_longest_length_uncertainty(assembled, solution, covariance),
             n_shots=n_shots,
-            used=problem.n_shots,
+            used=used,
             has_joints=has_joints,
-            has_certified_length=bool(problem.lengths),
+            # a laser tracker's points are lengths in themselves
+            has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
             line_profile=line_profile,
             covariance_scale=scale,
+            external_rms_mm=external_rms if np.isfinite(external_rms) else None,
         ),
         identifiability,
     )
@@ -86,13 +95,13 @@ def make_result(
         sphere_centres_in_base_mm={name: se3.apply(datum.base_from_solver, c) for name, c in zip(names, state.centres_in_base_mm, strict=True)},
         sphere_radius_offsets_mm={name: state.radius_offset_mm + float(d) for name, d in zip(names, state.sphere_radius_deviation_mm, strict=True)},
         datum=datum,
-        seen_joints_rad=None if problem.joints_rad is None else np.array([problem.joints_rad.min(axis=0), problem.joints_rad.max(axis=0)]),
+        seen_joints_rad=None if joints is None else np.array([joints.min(axis=0), joints.max(axis=0)]),
         noise=solution.noise,
-        parameter_names=parameter_names(problem.layout, problem.terms, names),
+        parameter_names=parameter_names(problem.layout, problem.terms, names) + external_names(problem.external),
         covariance=covariance,
         statistics=Statistics(
             n_shots=n_shots,
-            used=problem.n_shots,
+            used=used,
             rank=identifiability.rank,
             n_parameters=identifiability.n_parameters,
             condition=identifiability.condition,
@@ -114,8 +123,16 @@ def make_result(
         identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
         created_utc=created_utc,
         software=software,
+        external=external_result(problem, state, datum, covariance, solved.external_held_out_mm, external_predicted),
     )
     return replace(result, id=str(calibration_data(result)["id"]))
+
+
+def _all_joints(problem: Problem) -> FloatArray | None:
+    """(k, n) axis angles of spheres and external points; None for pose-only data."""
+    if problem.joints_rad is None:
+        return None
+    return problem.joints_rad if problem.external is None else np.concatenate([problem.joints_rad, problem.external.joints_rad])
 
 
 def _predicted_centre_rms(assembled: Assembled, solution: Solution) -> float:

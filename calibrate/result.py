@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from acquire.cell import Limits
 from calibrate.camera_error import CameraError, correction_in_camera_mm
 from calibrate.datum import Datum, datum_jacobian, link_columns, term_columns, twist_columns
+from calibrate.external_result import ExternalResult
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
 from calibrate.robot_terms import RobotTerm, deflection_rad, load_basis
@@ -114,6 +115,10 @@ class Calibration:
     identity: Mapping[str, object]
     created_utc: str
     software: str
+    hand_eye: str = "calibrated"
+    """Where `flange_from_camera` comes from: `calibrated`; where only external points were seen, `cell` or `none` (identity)."""
+    external: ExternalResult | None = None
+    """Frames and targets of external reference points; None where none was seen."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -232,6 +237,7 @@ class Calibration:
             "verdict": self.verdict,
             "reasons": list(self.reasons),
             "seconds": s.seconds,
+            **({} if self.external is None else {"external": self.external.to_json_dict(), "hand_eye": self.hand_eye}),
         }
 
     def _shot_covariance(self, points: FloatArray, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None) -> FloatArray:
@@ -249,6 +255,11 @@ class Calibration:
     def _solver_flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:
         if (joints_rad is None) == (base_from_flange is None):
             raise SettingsError("give exactly one of joints_rad and base_from_flange", remedy=self._wanted())
+        if self.hand_eye == "none":
+            raise SettingsError(
+                "this calibration is of the robot alone: nothing is known of where its camera sits",
+                remedy="Calibrate on shots of spheres too, or give flange_from_camera in the cell file before calibrating.",
+            )
         if base_from_flange is not None:
             return self._given_pose(base_from_flange)
         q = np.asarray(joints_rad, dtype=np.float64)

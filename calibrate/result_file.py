@@ -15,6 +15,7 @@ import numpy as np
 from acquire.cell import Limits
 from calibrate.camera_error import camera_error_from_settings
 from calibrate.datum import Datum
+from calibrate.external_result import external_data, external_from_data
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
 from calibrate.robot_terms import RobotTerm
@@ -77,6 +78,8 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "rejected": [asdict(shot) for shot in c.rejected],
         "shots": [_shot_data(shot) for shot in c.shots],
     }
+    if c.external is not None:
+        data |= {"hand_eye": c.hand_eye, "external": external_data(c.external)}
     plain = _plain(data)
     return {**plain, "id": content_id(plain)}
 
@@ -154,7 +157,15 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         identity=_mapping(data["identity"]),
         created_utc=str(data["created_utc"]),
         software=str(data["software"]),
+        hand_eye=_hand_eye(data.get("hand_eye", "calibrated")),
+        external=None if data.get("external") is None else external_from_data(_mapping(data["external"])),
     )
+
+
+def _hand_eye(value: object) -> str:
+    if value not in ("calibrated", "cell", "none"):
+        raise ValueError(f"unknown hand_eye {value!r}")
+    return str(value)
 
 
 def _term(data: Mapping[str, object]) -> RobotTerm:

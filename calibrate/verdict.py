@@ -26,6 +26,8 @@ class Evidence:
     has_certified_length: bool
     line_profile: bool
     covariance_scale: float
+    external_rms_mm: float | None = None
+    """Rms of held-out external points; None without any."""
 
 
 def judge(evidence: Evidence, identifiability: Identifiability) -> tuple[str, tuple[str, ...]]:
@@ -50,6 +52,8 @@ def _grave(e: Evidence, identifiability: Identifiability) -> list[str]:
         found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
     if e.limits is not None and not e.line_profile and e.cross_validated_rms_mm > e.limits.centre_rms_mm:
         found.append(f"held-out shots are missed by {e.cross_validated_rms_mm:.3f} mm rms, the limit is {e.limits.centre_rms_mm:g} mm")
+    if e.limits is not None and e.external_rms_mm is not None and e.external_rms_mm > e.limits.centre_rms_mm:
+        found.append(f"held-out external points are missed by {e.external_rms_mm:.3f} mm rms, the limit is {e.limits.centre_rms_mm:g} mm")
     return found
 
 
