@@ -12,7 +12,8 @@ targets (3 T). The pose noise is a nuisance twist per scan,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,12 +111,12 @@ class Problem:
         """Where each unknown sits."""
         n_links = 0 if self.joints_rad is None else self.joints_rad.shape[1]
         n_references, n_targets = (0, 0) if self.external is None else (len(self.external.references), len(self.external.targets))
-        return Layout(n_links, len(self.camera_error.axis), len(self.terms), len(self.radius_mm), n_references, n_targets)
+        return _layout(n_links, len(self.camera_error.axis), len(self.terms), len(self.radius_mm), n_references, n_targets)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Layout:
-    """Slices of the vector of unknowns."""
+    """Slices of the vector of unknowns; no slots, because each is worked out once and kept."""
 
     n_links: int
     n_camera: int
@@ -124,60 +125,63 @@ class Layout:
     n_references: int = 0
     n_targets: int = 0
 
-    @property
+    @cached_property
     def links(self) -> slice:
         """Link twists."""
         return slice(0, 6 * self.n_links)
 
-    @property
+    @cached_property
     def hand_eye(self) -> slice:
         """Hand-eye update."""
         return slice(6 * self.n_links, 6 * self.n_links + 6)
 
-    @property
+    @cached_property
     def camera(self) -> slice:
         """Camera coefficients."""
         return slice(self.hand_eye.stop, self.hand_eye.stop + self.n_camera)
 
-    @property
+    @cached_property
     def terms(self) -> slice:
         """Deflection terms of the arm."""
         return slice(self.camera.stop, self.camera.stop + self.n_terms)
 
-    @property
+    @cached_property
     def radius_offset(self) -> slice:
         """The shared optical radius offset."""
         return slice(self.terms.stop, self.terms.stop + 1)
 
-    @property
+    @cached_property
     def sphere_radius(self) -> slice:
         """Radius deviation of each sphere."""
         return slice(self.radius_offset.stop, self.radius_offset.stop + self.n_spheres)
 
-    @property
+    @cached_property
     def centres(self) -> slice:
         """Sphere centres."""
         return slice(self.sphere_radius.stop, self.sphere_radius.stop + 3 * self.n_spheres)
 
-    @property
+    @cached_property
     def references(self) -> slice:
         """Frames of external points."""
         return slice(self.centres.stop, self.centres.stop + 6 * self.n_references)
 
-    @property
+    @cached_property
     def targets(self) -> slice:
         """Targets of external points."""
         return slice(self.references.stop, self.references.stop + 3 * self.n_targets)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of unknowns."""
         return int(self.targets.stop)
 
-    @property
+    @cached_property
     def n_geometric(self) -> int:
         """Robot, hand-eye and camera with the arm's deflection: what moves a measured point."""
         return int(self.terms.stop)
+
+
+_layout = lru_cache(Layout)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,6 +237,10 @@ class Geometry:
     """(m, v - 1, P): rows u (camera axes), camera basis, radius; columns the unknowns."""
     noise_columns: FloatArray
     """(m, 3, 6): displacement in camera axes per nuisance twist."""
+
+    def subset(self, keep: IntArray) -> Geometry:
+        """The same of some shots (indices)."""
+        return Geometry(*(getattr(self, each.name)[keep] for each in fields(self)))
 
 
 def corrected_chain(problem: Problem, state: State) -> FloatArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate import normal
 from calibrate.assemble import subset, without_pose_noise
 from calibrate.clouds import Solution, solve_clouds
 from calibrate.problem import Geometry, Problem, State, linearise_geometry
@@ -17,7 +18,9 @@ from drivers.kinematics.se3 import FloatArray
 
 N_FOLDS = 10
 _FOLD_TOLERANCE_MM = 1e-4
-_CENTRE_ROUNDS = 6
+_LINEAR_MM = 0.2
+"""Motion of a centre up to which the linearisation of the whole solve is good to a micrometre."""
+_CENTRE_ROUNDS, _CENTRE_TOLERANCE_MM = 6, 1e-7
 _LEAVE_ONE_OUT_BELOW = 30
 
 
@@ -64,8 +67,11 @@ def shot_centres_in_base_mm(problem: Problem, state: State, geometry: Geometry) 
     for _ in range(_CENTRE_ROUNDS):
         moments, _ = shot_moments(problem, state, replace(geometry, centre_in_camera_mm=centres), np.inf)
         # a cap that shows next to nothing of one direction must not throw its centre away
-        normal = moments[:, :3, :3] + 1e-9 * np.trace(moments[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        centres = centres + np.linalg.solve(normal, moments[:, :3, -1:])[..., 0]
+        information = moments[:, :3, :3] + 1e-9 * np.trace(moments[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(information, moments[:, :3, -1:])[..., 0]
+        centres = centres + step
+        if np.abs(step).max() < _CENTRE_TOLERANCE_MM:
+            break
     return se3.apply(geometry.base_from_camera, centres)
 
 
@@ -96,7 +102,17 @@ def cross_validate(solution: Solution, n_folds: int = N_FOLDS, solve: Callable[[
 
 
 def _solved_on(solution: Solution, keep: NDArray[np.int64]) -> State:
-    training = subset(solution.problem, keep)
+    """The state that some shots alone give: one step from the whole solution on their sums, or a solve where it leads far."""
+    problem, geometry = solution.problem, solution.geometry
+    if problem.external is None:
+        training = subset(replace(problem, points_in_camera_mm=problem.points_in_camera_mm[:0], starts=np.zeros_like(problem.starts)), keep)
+        state = replace(solution.state, pose_noise=solution.state.pose_noise[np.unique(problem.scan[keep])])
+        weight = solution.noise.point_weight(np.diff(problem.starts).astype(np.float64), np.linalg.norm(geometry.centre_in_camera_mm, axis=1))
+        linearised = normal.linearise(training, state, geometry.subset(keep), solution.moments[keep], weight[keep])
+        step, noise_step = normal.solve_step(linearised, normal.reduce(linearised, solution.noise.pose_precision))
+        if np.abs(geometry.columns[:, :3] @ step).max() < _LINEAR_MM:
+            return state.moved(problem.layout, step, noise_step)
+    training = subset(problem, keep)
     start = without_pose_noise(solution.state, training.n_scans)
     return solve_clouds(training, start, solution.noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM).state
 
