@@ -19,18 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate import normal
-from calibrate.assemble import subset, without_pose_noise
+from calibrate.assemble import subset
 from calibrate.clouds import Solution
 from calibrate.normal import NoiseModel
 from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
-from calibrate.sums import POINT_CUTOFF_SIGMAS, patch_sums, shot_moments
+from calibrate.sums import ShotSums, shot_sums
 from calibrate.validation import Prediction, cross_validate
-from calibrate.variance import estimate_point_noise, estimate_pose_noise
+from calibrate.variance import estimate_incidence, estimate_point_noise, estimate_pose_noise, estimate_range_growth
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics.se3 import FloatArray
 
 _FIT_TOLERANCE_MM = 1e-9
-_ROUGH_TOLERANCE_MM = 1e-4
 _NOISE_TOLERANCE = 1e-3
 _LOOSE = 1e-6
 _LEAST_SHARE, _LEVER_MM = 1e-3, 500.0
@@ -42,7 +41,7 @@ _MAX_STEPS = 30
 _MAX_ROUNDS = 25
 _LAST_ESTIMATE = 6
 """Rounds in which the noise model is estimated anew; later ones hold it, so that the descent can end."""
-_IN_PLACE_MM, _LATER_SWEEPS = 0.05, 2
+_IN_PLACE_MM, _SWEEPS = 0.05, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,13 +58,14 @@ class CentreFits:
     """(k,) of the correction that the points had."""
     radius_mm: FloatArray
     """(m,) that was held."""
-    counts: FloatArray
-    """(m, 3): sum of the weights, of the squared residuals, number of points."""
+    n_points: FloatArray
+    """(m,)."""
+    point_rms_mm: FloatArray
+    """(m,) rms radial residual about each shot's own centre."""
 
-    @property
-    def point_rms_mm(self) -> FloatArray:
-        """(m,) rms radial residual about each shot's own centre."""
-        return np.asarray(np.sqrt(self.counts[:, 1] / self.counts[:, 2]))
+    def weight(self, noise: NoiseModel) -> FloatArray:
+        """(m,) weight in mm^-2 of one point of each shot."""
+        return noise.point_weight(self.n_points, np.linalg.norm(self.centre_in_camera_mm, axis=1))
 
     def centres_at(self, problem: Problem, state: State) -> FloatArray:
         """(m, 3) where the fits would be at a state, to first order."""
@@ -88,42 +88,53 @@ class CentreFits:
     def subset(self, keep: NDArray[np.int64]) -> CentreFits:
         """The fits of some shots (indices)."""
         return CentreFits(
-            self.centre_in_camera_mm[keep], self.information[keep], self.follows[keep], self.camera_mm, self.radius_mm[keep], self.counts[keep]
+            centre_in_camera_mm=self.centre_in_camera_mm[keep],
+            information=self.information[keep],
+            follows=self.follows[keep],
+            camera_mm=self.camera_mm,
+            radius_mm=self.radius_mm[keep],
+            n_points=self.n_points[keep],
+            point_rms_mm=self.point_rms_mm[keep],
         )
 
 
-def fit_centres(problem: Problem, state: State, geometry: Geometry, cutoff_mm: float, tolerance_mm: float = _FIT_TOLERANCE_MM) -> CentreFits:
+def fit_centres(
+    problem: Problem, state: State, geometry: Geometry, noise: NoiseModel | None, tolerance_mm: float = _FIT_TOLERANCE_MM, *, patches: bool = False
+) -> tuple[CentreFits, ShotSums]:
     """Fit every shot's centre to its corrected points, from where `geometry` expects it.
 
-    Points beyond the cutoff weigh next to nothing, as in the whole-cloud solver.
+    Points are weighted by incidence and robust loss as the noise model says, or all alike without one. Also returns the
+    sums of the last pass, by patch where asked for.
 
     Raises DataError where the points of a shot leave its centre open.
     """
     for _ in range(_MAX_FIT_PASSES):
-        moments, counts = shot_moments(problem, state, geometry, cutoff_mm)
-        information = moments[:, :3, :3]
-        _check_fixed(problem, information)
-        solved = np.linalg.solve(information, moments[:, :3, 3:])
-        geometry = replace(geometry, centre_in_camera_mm=geometry.centre_in_camera_mm + solved[..., -1])
-        if np.abs(solved[..., -1]).max() < tolerance_mm:
+        sums = shot_sums(problem, state, geometry, noise, patches=patches)
+        information = sums.moments[:, :3, :3]
+        _check_fixed(information)
+        step = np.linalg.solve(sums.curved_moments[:, :3, :3], sums.moments[:, :3, -1:])[..., 0]
+        geometry = replace(geometry, centre_in_camera_mm=geometry.centre_in_camera_mm + step)
+        if np.abs(step).max() < tolerance_mm:
             break
-    return CentreFits(
+    fits = CentreFits(
         centre_in_camera_mm=geometry.centre_in_camera_mm,
         information=information,
-        follows=np.asarray(solved[..., :-1]),
+        follows=np.asarray(np.linalg.solve(information, sums.moments[:, :3, 3:-1])),
         camera_mm=state.camera_mm,
         radius_mm=expected_radius_mm(problem, state),
-        counts=counts,
+        n_points=sums.counts[:, 2],
+        point_rms_mm=sums.point_rms_mm,
     )
+    return fits, sums
 
 
-def _check_fixed(problem: Problem, information: FloatArray) -> None:
+def _check_fixed(information: FloatArray) -> None:
     """A cap so small that it looks flat moves freely across the line of sight."""
     values = np.linalg.eigvalsh(information)
-    loose = np.flatnonzero(values[:, 0] < _LOOSE * values[:, 2])
-    if len(loose):
+    n_loose = int((values[:, 0] < _LOOSE * values[:, 2]).sum())
+    if n_loose:
         raise DataError(
-            f"the points of {len(loose)} of {problem.n_shots} shots leave their sphere's centre open",
+            f"the points of {n_loose} of {len(information)} shots leave their sphere's centre open",
             remedy="Use --method clouds, which needs no centres.",
         )
 
@@ -137,17 +148,17 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
     """
     if not problem.along_sight:
         raise SettingsError("one line profile leaves its sphere's centre open: there are no centres to solve on", remedy="Use --method clouds.")
-    state, cutoff, estimating = start, np.inf, True
+    state, estimating, known = start, True, None
     geometry = linearise_geometry(problem, state)
     for passes in range(1, _MAX_ROUNDS + 1):
-        fits = fit_centres(problem, state, geometry, cutoff, _ROUGH_TOLERANCE_MM if estimating else _FIT_TOLERANCE_MM)
-        expected, before = fits.centres_at(problem, state), noise
+        # one pass a round, from where the last fit is expected, but for the first
+        fits, sums = fit_centres(problem, state, geometry, known, _IN_PLACE_MM if known is None else np.inf, patches=estimating)
+        before, expected = noise, geometry.centre_in_camera_mm
         if estimating:
-            noise = _point_noise(problem, state, geometry, fits, cutoff, noise)
-            cutoff = POINT_CUTOFF_SIGMAS * float(np.hypot(noise.point_mm, noise.form_mm))
-        solution = _solve_on(fits, problem, state, noise, estimate_noise=estimating)
+            noise = _point_noise(sums, noise, first=known is None)
+        solution = _solve_on(fits, problem, state, noise, estimate_noise=estimating, in_place=known is not None)
         state, noise = solution.state, solution.noise
-        geometry = replace(solution.geometry, centre_in_camera_mm=fits.centres_at(problem, state))
+        geometry, known = replace(solution.geometry, centre_in_camera_mm=fits.centres_at(problem, state)), noise
         moved_mm = float(np.abs(geometry.centre_in_camera_mm - expected).max())
         if not estimating and moved_mm < _ROUND_TOLERANCE_MM:
             return replace(solution, passes=passes)
@@ -161,43 +172,53 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
 def cross_validate_centres(solution: Solution) -> Prediction:
     """Every shot predicted by a solve on the centres of the others; these are not fitted anew, they follow the camera."""
     problem, noise = solution.problem, solution.noise
-    cutoff = POINT_CUTOFF_SIGMAS * float(np.hypot(noise.point_mm, noise.form_mm))
-    fits = fit_centres(problem, solution.state, solution.geometry, cutoff, _FIT_TOLERANCE_MM)
+    fits, _ = fit_centres(problem, solution.state, solution.geometry, noise)
+    blind = replace(problem, points_in_camera_mm=problem.points_in_camera_mm[:0], starts=np.zeros_like(problem.starts))
 
     def without(keep: NDArray[np.int64]) -> State:
-        training = subset(problem, keep)
-        start = without_pose_noise(solution.state, training.n_scans)
+        training = subset(blind, keep)
+        start = replace(solution.state, pose_noise=solution.state.pose_noise[np.unique(problem.scan[keep])])
         return _solve_on(fits.subset(keep), training, start, noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM).state
 
     return cross_validate(solution, solve=without)
 
 
-def _point_noise(problem: Problem, state: State, geometry: Geometry, fits: CentreFits, cutoff_mm: float, noise: NoiseModel) -> NoiseModel:
-    at_fits = replace(geometry, centre_in_camera_mm=fits.centre_in_camera_mm)
-    found = estimate_point_noise(patch_sums(problem, state, at_fits, cutoff_mm), noise)
+def _point_noise(sums: ShotSums, noise: NoiseModel, *, first: bool) -> NoiseModel:
+    found = estimate_point_noise(sums.patches, noise)
+    if not first:
+        found = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.bands, found))
     # centres of noise-free points are known so well beside poses that the elimination of these would drown in rounding
     return replace(found, point_mm=max(found.point_mm, _LEAST_SHARE * max(noise.pose_mm, _LEVER_MM * noise.pose_rad)))
 
 
 def _solve_on(
-    fits: CentreFits, problem: Problem, state: State, noise: NoiseModel, *, estimate_noise: bool, tolerance_mm: float = _STEP_TOLERANCE_MM
+    fits: CentreFits,
+    problem: Problem,
+    state: State,
+    noise: NoiseModel,
+    *,
+    estimate_noise: bool,
+    in_place: bool = True,
+    tolerance_mm: float = _STEP_TOLERANCE_MM,
 ) -> Solution:
-    """Gauss-Newton on centres alone; while the noise is estimated the last digits are left to a later round."""
-    weight = noise.point_weight(fits.counts[:, 2])
-    step_mm = np.inf
+    """Gauss-Newton on centres alone; while the noise is estimated the last digits are left to a later round.
+
+    The noise is not estimated before the state is in place: until then all that the start is off would be noise.
+    """
+    weight = fits.weight(noise)
     for _ in range(_MAX_STEPS):
         geometry = linearise_geometry(problem, state)
         moments = fits.moments(problem, state, geometry)
         linearised = normal.linearise(problem, state, geometry, moments, weight)
-        # not before the state has found its place: until then all that the start is off would be noise
-        if estimate_noise and step_mm < _IN_PLACE_MM:
-            noise = estimate_pose_noise(linearised, noise, sweeps=_LATER_SWEEPS)
+        if estimate_noise and in_place:
+            noise = estimate_pose_noise(linearised, noise, sweeps=_SWEEPS)
         reduced = normal.reduce(linearised, noise.pose_precision)
-        if step_mm < (_ROUGH_TOLERANCE_MM if estimate_noise else tolerance_mm):
-            break
         step, noise_step = normal.solve_step(linearised, reduced)
         state = state.moved(problem.layout, step, noise_step)
         step_mm = float(np.abs(geometry.columns[:, :3] @ step).max())
+        if (estimate_noise and in_place) or step_mm < tolerance_mm:
+            break
+        in_place = step_mm < _IN_PLACE_MM
     return Solution(problem, state, noise, linearised, reduced, geometry, moments, fits.point_rms_mm, 0)
 
 
