@@ -9,8 +9,8 @@ import pytest
 
 from calibrate.normal import NoiseModel, linearise
 from calibrate.problem import Problem, State, linearise_geometry
-from calibrate.sums import patch_sums, shot_moments
-from calibrate.variance import estimate_point_noise, estimate_pose_noise
+from calibrate.sums import ShotSums, patch_sums, shot_moments, shot_sums
+from calibrate.variance import estimate_incidence, estimate_point_noise, estimate_pose_noise, estimate_range_growth
 from drivers.kinematics.se3 import FloatArray
 from tests.support.solving import draw_shots, problem_of, start_of
 from tests.support.synthetic import SyntheticCell, paper_cell
@@ -106,3 +106,44 @@ def test_empty_patches_and_tiny_shots_are_no_division_by_zero() -> None:
     found = point_noise(problem, state)
     assert np.isfinite([found.point_mm, found.form_mm]).all()
     assert found.point_mm > 0
+
+
+def sums_of(problem: Problem, state: State) -> ShotSums:
+    return shot_sums(problem, state, linearise_geometry(problem, state), None, patches=True)
+
+
+def test_noise_along_the_sight_shows_as_the_square_of_the_cosine() -> None:
+    """Its share of a residual along the normal; nothing is left where the sight grazes, but some trust is always withheld."""
+    found = estimate_incidence(sums_of(*made(4, 60, 500, 0.08, (0.0, 0.0))).bands, replace(FIRST, form_mm=0.0))
+    assert 0.1 <= found.flat < 0.22
+    cos2 = 7 / 12
+    assert found.flat + found.steep * cos2 == pytest.approx(1.0, abs=0.08)
+
+
+def test_noise_of_the_surface_shows_at_every_incidence() -> None:
+    problem, state = made(5, 60, 500, 1e-6, (0.0, 0.0))
+    rng, centre = np.random.default_rng(5), np.repeat(linearise_geometry(problem, state).centre_in_camera_mm, np.diff(problem.starts), axis=0)
+    away = problem.points_in_camera_mm - centre
+    noisy = problem.points_in_camera_mm + away / np.linalg.norm(away, axis=1)[:, None] * rng.normal(0, 0.05, (len(away), 1))
+    found = estimate_incidence(sums_of(replace(problem, points_in_camera_mm=noisy), state).bands, replace(FIRST, form_mm=0.0))
+    assert found.flat > 0.85
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0])
+def test_noise_that_grows_with_the_range_is_found_to(power: float) -> None:
+    problem, state = made(6, 80, 400, 1e-6, (0.0, 0.0))
+    distance = np.linalg.norm(problem.points_in_camera_mm, axis=1, keepdims=True)
+    noise_mm = np.random.default_rng(6).normal(0, 0.05, distance.shape) * (distance / 320.0) ** power
+    noisy = replace(problem, points_in_camera_mm=problem.points_in_camera_mm * (1 + noise_mm / distance))
+    sums = sums_of(noisy, state)
+    found = estimate_range_growth(sums.patches, sums.range_mm, estimate_point_noise(sums.patches, FIRST))
+    assert found.range_power == pytest.approx(power, abs=0.15)
+    # a shot's range is its centre's; the points lie some 15 mm nearer
+    expected_mm = 0.05 * np.sqrt(7 / 12) * (305.0 / 320.0) ** power
+    assert float(found.point_sigma_mm(np.array([320.0]))[0]) == pytest.approx(expected_mm, rel=0.12)
+
+
+def test_one_range_tells_nothing_of_its_growth() -> None:
+    sums = sums_of(*made(7, 30, 200, 0.08, (0.0, 0.0)))
+    here = sums.range_mm * 1e-4 + 350.0
+    assert estimate_range_growth(sums.patches, here, FIRST).range_power < 0.05
