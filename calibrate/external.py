@@ -2,8 +2,9 @@
 
 Residual of a shot, three rows in base axes: `base_from_flange(q) target + e - base_from_reference p`, p the measured
 point, e the displacement that the stop's pose noise causes at the target: the same link twists, deflection terms and
-pose-noise law as for spheres, so that both kinds of shot add to the same sums. Frame and target are unknowns without a
-prior. A measured point is a distance in itself: it brings the scale that spheres alone only have from their diameters.
+pose-noise law as for spheres, so that both kinds of shot add to the same sums. Frame and target are unknowns with no more
+than a far and weak hold at the first guess, for points that leave them open. Distances between measured points bring the
+scale that spheres alone only have from their diameters.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import numpy as np
 from calibrate.datum import link_columns, term_columns
 from calibrate.external_points import ExternalPoints
 from calibrate.normal import Linearised, NoiseModel, marginal_cost
-from calibrate.problem import Problem, State
+from calibrate.problem import Layout, Problem, State
 from calibrate.variance import minimise_by_parabolas
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.se3 import FloatArray
 
 FIRST_NOISE_MM = 0.03
+_HOLD_MM, _HOLD_RAD = 100.0, 0.3
 _TYPICAL_NOISE_MM, _TYPICAL_FACTOR = 0.015, 2.0
 """What a laser tracker's points scatter by on each axis, give or take a factor: translations of the flange look the same
 in these points alone, and only this tells how much of a scatter is whose."""
@@ -38,6 +40,10 @@ class ExternalRows:
     """(E, 3, P)."""
     noise_columns: FloatArray
     """(E, 3, 6): displacement per nuisance twist of the stop."""
+    hold_precision: FloatArray
+    """(P,) inverse variances of the weak hold on frames and targets, zero elsewhere."""
+    hold_value: FloatArray
+    """(P,) how far they are from where they are held."""
 
     def pose_covariance_mm2(self, noise: NoiseModel) -> FloatArray:
         """(E, 3, 3) of one measured point about the model: tracker and pose noise."""
@@ -73,7 +79,17 @@ def external_rows(problem: Problem, state: State) -> ExternalRows | None:
     for axis in range(3):
         columns[rows, :, layout.targets.start + 3 * points.target + axis] = flange[:, :3, axis]
     residual = seen - told + np.einsum("eij,ej->ei", noise_columns, pose_noise)
-    return ExternalRows(points, residual, columns, noise_columns)
+    return ExternalRows(points, residual, columns, noise_columns, *_hold(points, state, layout))
+
+
+def _hold(points: ExternalPoints, state: State, layout: Layout) -> tuple[FloatArray, FloatArray]:
+    precision, value = np.zeros(layout.size), np.zeros(layout.size)
+    if points.first_base_from_reference is not None and points.first_target_in_flange_mm is not None:
+        precision[layout.references] = np.tile([_HOLD_MM**-2] * 3 + [_HOLD_RAD**-2] * 3, layout.n_references)
+        value[layout.references] = se3.log(state.base_from_reference @ se3.inverse(points.first_base_from_reference)).ravel()
+        precision[layout.targets] = _HOLD_MM**-2
+        value[layout.targets] = (state.target_in_flange_mm - points.first_target_in_flange_mm).ravel()
+    return precision, value
 
 
 def joined(spheres: Linearised, rows: ExternalRows, noise: NoiseModel) -> Linearised:
@@ -91,13 +107,13 @@ def joined(spheres: Linearised, rows: ExternalRows, noise: NoiseModel) -> Linear
     hessian = weighted.T @ flat
     return replace(
         spheres,
-        hessian=spheres.hessian + hessian,
-        gradient=spheres.gradient + weighted.T @ rows.residual_mm.reshape(-1),
+        hessian=spheres.hessian + hessian + np.diag(rows.hold_precision),
+        gradient=spheres.gradient + weighted.T @ rows.residual_mm.reshape(-1) + rows.hold_precision * rows.hold_value,
         data_hessian=spheres.data_hessian + hessian,
         noise_hessian=noise_hessian,
         noise_gradient=noise_gradient,
         cross=cross,
-        cost=spheres.cost + float((weight * (rows.residual_mm**2).sum(axis=1)).sum()),
+        cost=spheres.cost + float((weight * (rows.residual_mm**2).sum(axis=1)).sum() + (rows.hold_precision * rows.hold_value**2).sum()),
     )
 
 

@@ -63,6 +63,10 @@ class ExternalPoints:
     """Names of the frames."""
     targets: tuple[str, ...]
     """Names of the targets."""
+    first_base_from_reference: FloatArray | None = None
+    """(F, 4, 4) the start's frames: a far and weak hold where the points leave them open."""
+    first_target_in_flange_mm: FloatArray | None = None
+    """(T, 3) the start's targets, held likewise."""
 
     @property
     def n_shots(self) -> int:
@@ -73,6 +77,10 @@ class ExternalPoints:
     def n_stops(self) -> int:
         """Number of stops H."""
         return int(self.stop.max()) + 1 if self.n_shots else 0
+
+    def held_at(self, base_from_reference: FloatArray, target_in_flange_mm: FloatArray) -> ExternalPoints:
+        """The same points, frames (F, 4, 4) and targets (T, 3) held weakly where they are now."""
+        return replace(self, first_base_from_reference=base_from_reference, first_target_in_flange_mm=target_in_flange_mm)
 
     def subset(self, keep: NDArray[np.int64]) -> ExternalPoints:
         """Some of the shots (indices), stops numbered anew; every frame and target stays."""

@@ -94,7 +94,7 @@ def joined_by_external(
     alone = replace(alone, external=points)
     bare = replace(initial_state(alone, flange_from_camera, np.zeros((0, 3))), link_twists=state.link_twists)
     start = start_frames(alone, bare).state
-    problem = replace(problem, external=points)
+    problem = replace(problem, external=points.held_at(start.base_from_reference, start.target_in_flange_mm))
     state = replace(state, base_from_reference=start.base_from_reference, target_in_flange_mm=start.target_in_flange_mm)
     return problem, without_pose_noise(state, problem.n_scans), rejected
 
@@ -105,7 +105,8 @@ def believed(problem: Problem, points: ExternalPoints, state: State) -> tuple[Ex
     Raises DataError where no frame brings the points to the arm.
     """
     start = start_frames(problem, state)
-    layout = problem.layout
+    points = points.held_at(start.state.base_from_reference, start.state.target_in_flange_mm)
+    problem, layout = replace(problem, external=points), problem.layout
     unknowns = 4 * layout.n_links - 6 + 6 * layout.n_references + 3 * layout.n_targets
     if 3 * points.n_shots < unknowns + SPARE_ROWS:  # every point fits itself: none can be told to be wrong
         return start, points, ()

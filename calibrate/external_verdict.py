@@ -52,8 +52,11 @@ def robot_rank(solved: ExternalSolved) -> RobotRank:
     projected = information[:n, :n] - cross @ symmetric_inverse(information[np.ix_(rest, rest)]) @ cross.T
     scale = np.array(([1.0] * 3 + [ANGLE_SCALE_MM] * 3) * layout.n_links)
     values = np.linalg.eigvalsh(projected / scale[:, None] / scale)[::-1]
-    rank = int((values > _RELATIVE_ZERO * values[0]).sum())
-    return RobotRank(rank, n, 4 * layout.n_links - 6, float(np.sqrt(values[0] / values[rank - 1])))
+    # where frames and targets explain all, nothing but rounding is left: it must not be its own measure
+    largest = float(np.linalg.eigvalsh(information[:n, :n] / scale[:, None] / scale)[-1])
+    rank = int((values > _RELATIVE_ZERO * largest).sum())
+    condition = float(np.sqrt(values[0] / values[rank - 1])) if rank else float("inf")
+    return RobotRank(rank, n, 4 * layout.n_links - 6, condition)
 
 
 def robot_alone_result(

@@ -98,5 +98,8 @@ def _data_information(solution: Solution) -> FloatArray:
 
 
 def _nuisance_prior(problem: Problem) -> FloatArray:
-    offset = [problem.priors.radius_offset_mm**-2]
-    return np.concatenate([offset, problem.radius_sigma_mm**-2.0, np.zeros(3 * len(problem.radius_mm))])
+    layout = problem.layout
+    precision = np.zeros(layout.size)
+    precision[layout.radius_offset] = problem.priors.radius_offset_mm**-2
+    precision[layout.sphere_radius] = problem.radius_sigma_mm**-2.0
+    return precision[layout.radius_offset.start :]
