@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibrate.camera_error import (
+    PILLOW_SCALE_MM,
     CameraError,
+    FreeCrossing,
+    FullPillowError,
     NoCameraError,
     PillowError,
     PolynomialError,
@@ -18,6 +22,9 @@ from calibrate.camera_error import (
     camera_error_models,
     correction_in_camera_mm,
 )
+from calibrate.camera_error_field import field_variants, lateral_variants, richest_field
+from calibrate.camera_error_stack import StackedModels
+from calibrate.polynomials import Polynomials
 from drivers.errors import FileError, SettingsError
 from drivers.kinematics.se3 import FloatArray
 
@@ -25,13 +32,37 @@ CENTRE, HALF = (10.0, -5.0, 320.0), (120.0, 80.0, 90.0)
 AFFINE = PolynomialError(CENTRE, HALF, 1, name="affine")
 FIELD = PolynomialError(CENTRE, HALF, 3)
 PILLOW = PillowError((60.0, 0.0, 500.0))
-MODELS = [NoCameraError(), PILLOW, PillowError((-20.0, 3.0, 450.0), 2), AFFINE, FIELD]
+FULL = FullPillowError((55.0, -8.0, 480.0))
+FREE = FreeCrossing(PILLOW, (0.4, -0.2, 0.1))
+FREE_FULL = FreeCrossing(FULL, tuple(np.linspace(-0.3, 0.4, 9).tolist()), 30.0)
+MODELS = [
+    NoCameraError(),
+    PILLOW,
+    PillowError((-20.0, 3.0, 450.0), 2),
+    FULL,
+    FREE,
+    FREE_FULL,
+    AFFINE,
+    FIELD,
+    PolynomialError(CENTRE, HALF, 5, 2, 0.3, 0.05, decay=2),
+]
 every_model = pytest.mark.parametrize("model", MODELS, ids=lambda m: f"{m.name}{len(m.axis)}")
 
 
 def points(seed: int, n: int = 40, spread: float = 1.0) -> FloatArray:
     rng = np.random.default_rng(seed)
     return np.asarray(np.array(CENTRE) + spread * np.array(HALF) * rng.uniform(-1, 1, (n, 3)))
+
+
+def by_table(table: Polynomials, p: FloatArray) -> FloatArray:
+    """(n, k) terms of a kernel's table at points inside its box, by its own recurrence."""
+    functions = np.ones((3, len(table.forward) + 1, len(p)))
+    scaled = ((p - table.centre_mm) / table.scale_mm).T
+    for n in range(len(table.forward)):
+        functions[:, n + 1] = table.forward[n] * scaled * functions[:, n] - (table.backward[n] * functions[:, n - 1] if n else 0.0)
+    products = np.array([functions[0, i] * functions[1, j] * functions[2, k] for i, j, k in table.degrees]).reshape(-1, len(p))
+    terms = [table.factor[a:b] @ products[table.product[a:b]] for a, b in pairwise(table.starts)]
+    return np.asarray(np.array(terms).reshape(len(table.axis), len(p)).T)
 
 
 @every_model
@@ -79,6 +110,77 @@ def test_the_scaled_pillow_is_the_papers_formula(sight_crossing_mm: tuple[float,
 def test_a_pillow_coefficient_is_its_correction_in_mm_at_250_mm_from_the_crossing() -> None:
     at = np.array([[60.0, 40.0, 750.0]])
     np.testing.assert_allclose(PILLOW.basis(at), 1.0)
+
+
+@every_model
+def test_the_table_for_the_kernels_says_the_same_as_the_basis(model: CameraError) -> None:
+    p = points(20)
+    np.testing.assert_allclose(by_table(model.polynomials, p), model.basis(p), rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(model.polynomials.axis, model.axis)
+
+
+@pytest.mark.parametrize("crossing_mm", [(60.0, 0.0, 500.0), (-35.0, 12.0, 700.0)])
+def test_the_full_pillow_is_the_papers_equation_4(crossing_mm: tuple[float, float, float]) -> None:
+    model, p = FullPillowError(crossing_mm, 2), points(21)
+    k = np.random.default_rng(22).normal(size=6) * 1e-9
+    x, y, z = (p - crossing_mm).T
+    r2, scale = x * x + z * z, PILLOW_SCALE_MM ** np.array([3, 5, 3, 5, 3, 5])
+    paper = [
+        x * (k[2] * r2 + k[3] * r2**2),
+        y * (k[4] * (r2 + y * y) + k[5] * (r2 + y * y) ** 2),
+        z * (k[0] * r2 + k[1] * r2**2),
+    ]
+    np.testing.assert_allclose(correction_in_camera_mm(model, k * scale, p), np.transpose(paper), rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", [FREE, FREE_FULL], ids=lambda m: m.name)
+@pytest.mark.parametrize("coordinate", [0, 1, 2])
+def test_terms_of_a_free_crossing_are_derivatives_by_it(model: FreeCrossing, coordinate: int) -> None:
+    p, step = points(23), 1e-3
+
+    def corrected(shift_mm: float) -> FloatArray:
+        crossing = np.array(model.pillow.sight_crossing_mm)
+        crossing[coordinate] += shift_mm
+        return correction_in_camera_mm(type(model.pillow)(tuple(crossing)), np.array(model.about_mm), p)
+
+    chosen = (model.coordinate == coordinate).astype(np.float64)
+    change = correction_in_camera_mm(model, chosen, p)
+    np.testing.assert_allclose(change, (corrected(step) - corrected(-step)) / (2 * step), atol=1e-9)
+    # eq. 5 holds no y of the crossing
+    assert change.any() == (coordinate != 1 or isinstance(model.pillow, FullPillowError))
+
+
+def test_the_prior_of_a_field_falls_with_the_degree_as_told() -> None:
+    field = PolynomialError(CENTRE, HALF, 4, 2, 0.6, 0.1, decay=2)
+    for (axis, degrees), sigma_mm in zip(field.terms, field.prior_sigma_mm, strict=True):
+        assert sigma_mm == pytest.approx((0.6 if axis == 2 else 0.1) / sum(degrees) ** 2)
+
+
+def test_the_stiffest_field_comes_first_and_the_richest_holds_all() -> None:
+    box = (CENTRE, HALF)
+    variants = field_variants(box)
+    held = set(richest_field(box).terms)
+    assert all(set(one.terms) <= held for variant in variants for one in (variant, *lateral_variants(variant)))
+    assert variants[0].degree == min(v.degree for v in variants)
+    assert variants[0].prior_sigma_mm.max() == min(v.prior_sigma_mm.max() for v in variants)
+    assert len({str(v.settings()) for v in variants}) == len(variants)
+    assert lateral_variants(variants[0])[0].lateral_degree == 0
+
+
+@pytest.mark.parametrize("pillow", [PILLOW, FULL], ids=lambda m: m.name)
+def test_stacked_models_hold_each_model_in_its_columns(pillow: PillowError | FullPillowError) -> None:
+    stacked, p = StackedModels(richest_field((CENTRE, HALF)), (pillow,)), points(24)
+    rng = np.random.default_rng(25)
+    for model in (NoCameraError(), PolynomialError(CENTRE, HALF, 1, 1, name="affine"), pillow, PolynomialError(CENTRE, HALF, 4, 2, 0.3)):
+        part, coefficients = stacked.columns_of(model), rng.normal(size=len(model.axis))
+        np.testing.assert_array_equal(part.prior_sigma_mm, model.prior_sigma_mm)
+        there = stacked.coefficients_mm(model, coefficients)
+        np.testing.assert_allclose(
+            correction_in_camera_mm(stacked, there, p), correction_in_camera_mm(model, coefficients, p), rtol=1e-9, atol=1e-12
+        )
+    table = stacked.polynomials
+    np.testing.assert_array_equal(table.axis, stacked.axis)
+    np.testing.assert_allclose(by_table(table, p), stacked.basis(p), rtol=1e-8, atol=1e-9)
 
 
 def test_legendre_terms_inside_the_box_are_numpys() -> None:
