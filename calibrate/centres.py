@@ -139,6 +139,12 @@ def _check_fixed(information: FloatArray) -> None:
         )
 
 
+def require_centres(problem: Problem) -> None:
+    """Raise SettingsError for line profiles, of which one leaves its sphere's centre open."""
+    if not problem.along_sight:
+        raise SettingsError("one line profile leaves its sphere's centre open: there are no centres to solve on", remedy="Use --method clouds.")
+
+
 def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution:
     """Minimise the cost on centres from a start that is good to some millimetres; the noise model is estimated on the way.
 
@@ -146,8 +152,7 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
         SettingsError: line profiles, of which one leaves its sphere's centre open.
         DataError: the rounds do not settle, which means that data and model do not belong together.
     """
-    if not problem.along_sight:
-        raise SettingsError("one line profile leaves its sphere's centre open: there are no centres to solve on", remedy="Use --method clouds.")
+    require_centres(problem)
     state, estimating, known = start, True, None
     geometry = linearise_geometry(problem, state)
     for passes in range(1, _MAX_ROUNDS + 1):

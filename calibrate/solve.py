@@ -16,22 +16,24 @@ from acquire.cell import Cell, cell_of_session, robot_model_of
 from acquire.check import check_session
 from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
-from calibrate.centres import cross_validate_centres, solve_centres
+from calibrate.centres import cross_validate_centres, require_centres, solve_centres
 from calibrate.clouds import Solution, solve_clouds, thinned
 from calibrate.external_points import ExternalShot
 from calibrate.external_solve import held_out_errors, joined_by_external, solve_robot_alone, without_spoiled
 from calibrate.external_verdict import robot_alone_result
+from calibrate.model_choice import choose_model, is_open
 from calibrate.normal import NoiseModel
-from calibrate.observations import Observations, RejectedShot, SphereShot, gather_observations
+from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.plausibility import check_reported_poses
 from calibrate.plausibility_closure import check_closure
 from calibrate.plausibility_scans import check_units
 from calibrate.problem import Priors, Problem, State
 from calibrate.report_figures import make_result
 from calibrate.result import Calibration
+from calibrate.second_look import see_sessions
 from calibrate.start import start_from_centres
 from calibrate.start_arcs import start_from_arcs
-from calibrate.validation import Prediction, cross_validate, predict, shot_centre_covariance_mm2, squared_errors_mm2
+from calibrate.validation import Prediction, cross_validate, predict, shot_centre_covariance_mm2
 from drivers.errors import DataError, SettingsError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
@@ -45,8 +47,6 @@ _REJECT_CHI2 = 30.7
 """A clean shot exceeds this in one of a million cases (chi-square, three degrees of freedom)."""
 _MEDIAN_CHI2 = 2.366
 _REJECT_ROUNDS = 4
-_TYPICAL_CAP = 16.0
-"""Of the median squared error: four times the typical miss, beyond any clean shot's."""
 _FIRST_NOISE = NoiseModel(point_mm=0.05, pose_mm=0.3, pose_rad=5e-4)
 
 
@@ -55,7 +55,7 @@ class CalibrationSettings:
     """How to calibrate."""
 
     camera_error: str = "auto"
-    """auto, none, affine, pillow or field."""
+    """auto, none, affine, pillow, pillow-free, pillow-full, pillow-full-free or field."""
     method: str = "clouds"
     """clouds, centres for one fitted centre a shot, or stepwise for the paper's solver."""
     priors: Priors = field(default_factory=Priors)
@@ -103,7 +103,7 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
     began = time.perf_counter()
     cell, model = cell_of_sessions(sessions)
     notes = check_reported_poses(sessions, model)
-    observations = gather_observations(sessions, cell=cell, model=model)
+    observations = see_sessions(sessions, cell=cell, model=model)
     if model is not None and observations.external and not _show_spheres(sessions):
         return _calibrate_robot_alone(sessions, observations, cell, model, settings, notes, began)
     if not observations.shots:
@@ -199,6 +199,8 @@ def solve_observations(
         raise SettingsError(f"unknown method {settings.method!r}", remedy=f"Choose {', '.join(_SOLVERS)} or stepwise.")
     models = _candidates(observations, cell, settings)
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
+    if settings.method == "centres":
+        require_centres(first.problem)
     start, keep, rejected = _start(first, cell)
     problem = replace(first.problem, first_flange_from_camera=start.flange_from_camera)
     if settings.method == "clouds":
@@ -206,17 +208,13 @@ def solve_observations(
     else:
         spoiled = tuple(_not_taken(shot, settings.method) for shot in observations.external)
     first, rejected = replace(first, problem=problem), rejected + spoiled
-    if len(models) == 1:
+    if not is_open(models, problem):
         return _solve_and_reject(solver, first, start, keep, rejected), {}
-    keep = _kept_after_solve(solver, first, start, keep)
-    thin = _thinned(first)
-    tried = [_solve(solver, thin.subset(keep, model_), _for_model(start, model_)) for model_ in models]
-    chosen = _simplest_of_the_best(tried)
-    compared = {t.assembled.problem.camera_error.name: _held_out_rms(t) for t in tried}
-    _LOG.debug("held-out rms by camera error model: %s", compared)
-    state = without_pose_noise(tried[chosen].solution.state, first.problem.n_scans)
-    everything = first.subset(np.arange(first.problem.n_shots), models[chosen])
-    return _solve_and_reject(solver, everything, state, keep, rejected), compared
+    keep, about, rejected = _solved_on_some_points(solver, first, start, keep, rejected)
+    choice = choose_model(about, models)
+    _LOG.debug("held-out rms by camera error model: %s", choice.held_out_rms_mm)
+    everything = first.subset(np.arange(first.problem.n_shots), choice.model)
+    return _solve_and_reject(solver, everything, choice.state, keep, rejected), choice.held_out_rms_mm
 
 
 def _candidates(observations: Observations, cell: Cell, settings: CalibrationSettings) -> list[CameraError]:
@@ -239,12 +237,6 @@ def _start(assembled: Assembled, cell: Cell) -> tuple[State, NDArray[np.int64], 
     return start.state, np.flatnonzero(~start.spoiled), rejected
 
 
-def _solve(solver: _Solver, assembled: Assembled, start: State) -> Solved:
-    state = without_pose_noise(start, assembled.problem.n_scans)
-    solution = solver.solve(assembled.problem, state, _FIRST_NOISE)
-    return Solved(assembled, solution, solver.held_out(solution), ())
-
-
 def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64], rejected: tuple[RejectedShot, ...]) -> Solved:
     """Solve, reject the shots that the noise cannot explain, and solve again until none is left."""
     for _ in range(_REJECT_ROUNDS):
@@ -260,16 +252,20 @@ def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep
     return Solved(part, solution, solver.held_out(solution), rejected, held_out_errors(solution))
 
 
-def _kept_after_solve(solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64]) -> NDArray[np.int64]:
-    thin = _thinned(everything)
+def _solved_on_some_points(
+    solver: _Solver, everything: Assembled, start: State, keep: NDArray[np.int64], rejected: tuple[RejectedShot, ...]
+) -> tuple[NDArray[np.int64], Solution, tuple[RejectedShot, ...]]:
+    """A solve good enough to compare camera models about it, and the shots that it cannot explain."""
+    thin = replace(everything, problem=thinned(everything.problem, _THIN_POINTS))
     for _ in range(_REJECT_ROUNDS):
         part = thin.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, _ = _unexplained(part, solution)
+        far, miss_mm = _unexplained(part, solution)
         if not far.any():
             break
-        keep = keep[~far]
-    return keep
+        rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))
+        keep, start = keep[~far], solution.state
+    return keep, solution, rejected
 
 
 def _unexplained(assembled: Assembled, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
@@ -282,35 +278,6 @@ def _unexplained(assembled: Assembled, solution: Solution) -> tuple[NDArray[np.b
     chi2 = np.einsum("mi,mi->m", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
     typical = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
     return np.asarray(chi2 > _REJECT_CHI2 * typical), np.linalg.norm(miss, axis=1)
-
-
-def _thinned(assembled: Assembled) -> Assembled:
-    """At most some hundred points a shot, evenly through it: enough to compare models."""
-    return replace(assembled, problem=thinned(assembled.problem, _THIN_POINTS))
-
-
-def _for_model(state: State, camera_error: CameraError) -> State:
-    return replace(state, camera_mm=np.zeros(len(camera_error.axis)))
-
-
-def _simplest_of_the_best(tried: Sequence[Solved]) -> int:
-    """The first model whose held-out error is within one standard error (of the difference) of the best.
-
-    Errors are capped at some times the typical one: a lone pose that no solve without it predicts would drown the rest.
-    """
-    errors = [squared_errors_mm2(t.held_out) for t in tried]
-    cap = _TYPICAL_CAP * min(float(np.median(error)) for error in errors)
-    errors = [np.minimum(error, cap) for error in errors]
-    best = int(np.argmin([error.mean() for error in errors]))
-    for i, error in enumerate(errors):
-        difference = error - errors[best]
-        if difference.mean() <= difference.std(ddof=1) / np.sqrt(len(difference)):
-            return i
-    return best
-
-
-def _held_out_rms(solved: Solved) -> float:
-    return float(np.sqrt(squared_errors_mm2(solved.held_out).mean()))
 
 
 def _not_taken(shot: ExternalShot, method: str) -> RejectedShot:

@@ -88,7 +88,7 @@ def cell_of_the_solvers_own_kind(rng: np.random.Generator) -> SyntheticCell:
     return replace(cell, true=true, reads_large_mm=float(rng.normal(0, 0.03)), yields_rad=yields_rad)
 
 
-def random_unseen_lengths(seed: int, folder: Path, *, n_shots: int, n_points: int, n_lengths: int) -> list[UnseenLength]:
+def random_unseen_lengths(seed: int, folder: Path, *, n_shots: int, n_points: int, n_lengths: int, method: str = "clouds") -> list[UnseenLength]:
     """Calibrate a random cell on two spheres with their length, and measure lengths between random places of the volume."""
     rng = np.random.default_rng(seed)
     cell = cell_of_the_solvers_own_kind(rng)
@@ -96,6 +96,6 @@ def random_unseen_lengths(seed: int, folder: Path, *, n_shots: int, n_points: in
     members = {name: draw_shots(at, rng, n_shots // 2, n_points=n_points) for name, at in placed.items()}
     length = ("A", "B", float(np.linalg.norm(PLACES[0] - PLACES[1])) + float(rng.normal(0, 0.0025)), 0.005)
     session = read_session(write_session(folder, cell, members, flange_from_camera=None, lengths=[length]))
-    found = calibrate([session], CalibrationSettings(camera_error="pillow"))
+    found = calibrate([session], CalibrationSettings(camera_error="pillow", method=method))
     ends = rng.uniform(LOW_MM, HIGH_MM, (n_lengths, 2, 3))
     return [unseen_length(found, cell, a, b, rng) for a, b in ends]
