@@ -1,22 +1,65 @@
-"""What the data determine and what is gauge: rank, gap and condition of the scaled normal equations (METHOD.md 3)."""
+"""What the data determine and what is gauge: rank, gap, condition and observability of the scaled normal equations (METHOD.md 3).
+
+Singular values are those of the Jacobian of robot, hand-eye and camera, everything else projected out, in scaled units
+(mm, rad x 500 mm) and whitened by the noise: one over a singular value is the standard deviation in mm to which the
+shots alone tell that direction. Which directions stay open, and in whose words, is `calibrate.gauge`'s.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from calibrate.clouds import Solution
+from calibrate.gauge import ANGLE_SCALE_MM, OpenDirections, camera_gauge_twists, named_directions, parameter_scale
 from calibrate.normal import symmetric_inverse
 from calibrate.problem import Layout, Problem
 from calibrate.robot_terms import RobotTerm
-from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
-ANGLE_SCALE_MM = 500.0
-"""A radian counts as what it moves at this distance."""
+__all__ = [
+    "ANGLE_SCALE_MM",
+    "Identifiability",
+    "Observability",
+    "identifiability_of",
+    "observability_of",
+    "parameter_names",
+    "parameter_scale",
+]
+
 _RELATIVE_ZERO = 1e-8
 """Of squared singular values: what the pose noise breaks of the gauge stays below it, what shots determine above."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """Observability indices of the determined directions (Sun and Hollerbach 2008 give all five), larger is better.
+
+    With the singular values s_1 >= ... >= s_r of m shots (1 / mm, see the module):
+    """
+
+    o1: float
+    """(s_1 ... s_r)^(1/r) / sqrt(m), Borm and Menq 1991; does not depend on the scaling of the unknowns."""
+    o2: float
+    """s_r / s_1, Driels and Pathre 1990."""
+    o3: float
+    """s_r, Nahvi, Hollerbach and Hayward 1994."""
+    o4: float
+    """s_r^2 / s_1, the noise amplification index of Nahvi and Hollerbach 1996."""
+    o5: float
+    """1 / (1/s_1 + ... + 1/s_r), Sun and Hollerbach 2008."""
+
+
+def observability_of(singular_values: FloatArray, n_shots: int) -> Observability:
+    """The indices of the singular values (r,), falling and positive, of so many shots; zeros where there are none."""
+    if not len(singular_values) or not n_shots:
+        return Observability(0.0, 0.0, 0.0, 0.0, 0.0)
+    largest, smallest = float(singular_values[0]), float(singular_values[-1])
+    geometric_mean = float(np.exp(np.log(singular_values).mean()))
+    o5 = float(1.0 / (1.0 / singular_values).sum())
+    return Observability(geometric_mean / n_shots**0.5, smallest / largest, smallest, smallest**2 / largest, o5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,19 +76,47 @@ class Identifiability:
     """Ratio of the weakest determined to the strongest undetermined singular value; infinite without gauge."""
     singular_values: FloatArray
     """Of the Jacobian in scaled units (mm), whitened by the noise; falling."""
+    observability: Observability | None = None
+    """None where nobody asked."""
+    directions: tuple[OpenDirections, ...] = ()
+    """What the shots do not tell, in words."""
+
+    def to_json_dict(self) -> dict[str, object]:
+        """For the calibration file and `--json`."""
+        return {
+            "rank": self.rank,
+            "expected_rank": self.expected_rank,
+            "n_parameters": self.n_parameters,
+            "condition": self.condition,
+            "gap": self.gap,
+            "observability": None if self.observability is None else asdict(self.observability),
+            "singular_values": self.singular_values,
+            "directions": [asdict(group) for group in self.directions],
+        }
+
+    @classmethod
+    def from_json_dict(cls, data: Mapping[str, object]) -> Identifiability:
+        """What `to_json_dict` wrote; KeyError, TypeError or ValueError for anything else."""
+        indices, groups = data["observability"], data["directions"]
+        return cls(
+            rank=int(str(data["rank"])),
+            n_parameters=int(str(data["n_parameters"])),
+            expected_rank=int(str(data["expected_rank"])),
+            condition=_number(data["condition"]),
+            gap=_number(data["gap"]),
+            singular_values=np.asarray(data["singular_values"], dtype=np.float64),
+            observability=Observability(**{key: _number(value) for key, value in indices.items()}) if isinstance(indices, Mapping) else None,
+            directions=tuple(OpenDirections.from_data(group) for group in groups) if isinstance(groups, list | tuple) else (),
+        )
 
 
 def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
     """Look at a solution's information about its geometric unknowns, priors of these left out."""
     layout = problem.layout
     n = layout.camera.stop
-    information = _data_information(solution)
-    rest = np.arange(layout.radius_offset.start, layout.size)
-    nuisance = information[np.ix_(rest, rest)] + np.diag(_nuisance_prior(problem))
-    cross = information[:n, rest]
-    projected = information[:n, :n] - cross @ symmetric_inverse(nuisance) @ cross.T
     scale = parameter_scale(layout)
-    values = np.linalg.eigvalsh(projected / scale[:, None] / scale)[::-1]
+    values, vectors = np.linalg.eigh(_projected_information(problem, solution) / scale[:, None] / scale)
+    values, vectors = values[::-1], vectors[:, ::-1]
     rank = int((values > _RELATIVE_ZERO * values[0]).sum())
     singular = np.sqrt(np.maximum(values, 0.0))
     return Identifiability(
@@ -55,26 +126,14 @@ def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
         condition=float(singular[0] / singular[rank - 1]),
         gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if rank < n else float("inf"),
         singular_values=singular,
+        observability=observability_of(singular[:rank], problem.n_shots),
+        directions=named_directions(problem, solution.state, vectors[:, rank:], (vectors * values) @ vectors.T),
     )
 
 
 def camera_gauge(problem: Problem) -> int:
     """Number of directions in which the camera error model only repeats the hand-eye transform (lateral terms turn the view)."""
-    lower, upper = problem.points_in_camera_mm.min(axis=0), problem.points_in_camera_mm.max(axis=0)
-    points = np.random.default_rng(3).uniform(lower, upper, (200, 3))
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (200, 3, 3)), -se3.hat(points) / ANGLE_SCALE_MM], axis=-1)
-    basis, axis = problem.camera_error.basis(points), problem.camera_error.axis
-    camera = np.zeros((200, 3, len(axis)))
-    camera[:, axis, np.arange(len(axis))] = basis
-    fields = np.concatenate([rigid, camera], axis=-1).reshape(600, -1)
-    singular = np.linalg.svd(fields, compute_uv=False)
-    return int(fields.shape[1] - (singular > 1e-9 * singular[0]).sum())
-
-
-def parameter_scale(layout: Layout) -> FloatArray:
-    """(n,) mm per unit of each geometric unknown."""
-    twist = [1.0] * 3 + [ANGLE_SCALE_MM] * 3
-    return np.array(twist * (layout.n_links + 1) + [1.0] * layout.n_camera)
+    return len(camera_gauge_twists(problem))
 
 
 def parameter_names(layout: Layout, terms: tuple[RobotTerm, ...], spheres: tuple[str, ...]) -> tuple[str, ...]:
@@ -90,6 +149,16 @@ def parameter_names(layout: Layout, terms: tuple[RobotTerm, ...], spheres: tuple
     return tuple(names)
 
 
+def _projected_information(problem: Problem, solution: Solution) -> FloatArray:
+    """(n, n) of robot, hand-eye and camera, the other unknowns projected out."""
+    layout = problem.layout
+    n, rest = layout.camera.stop, np.arange(layout.radius_offset.start, layout.size)
+    information = _data_information(solution)
+    nuisance = information[np.ix_(rest, rest)] + np.diag(_nuisance_prior(problem))
+    cross = information[:n, rest]
+    return np.asarray(information[:n, :n] - cross @ symmetric_inverse(nuisance) @ cross.T)
+
+
 def _data_information(solution: Solution) -> FloatArray:
     """Points and lengths alone, pose noise eliminated."""
     gain = solution.reduced.noise_inverse @ solution.linearised.cross
@@ -103,3 +172,8 @@ def _nuisance_prior(problem: Problem) -> FloatArray:
     precision[layout.radius_offset] = problem.priors.radius_offset_mm**-2
     precision[layout.sphere_radius] = problem.radius_sigma_mm**-2.0
     return precision[layout.radius_offset.start :]
+
+
+def _number(value: object) -> float:
+    """A number of a file, where infinity is null."""
+    return float("inf") if value is None else float(str(value))

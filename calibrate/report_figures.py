@@ -11,18 +11,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.cell import Cell
+from acquire.plan import PlannedPose
+from calibrate.arm_branches import unseen_branch
 from calibrate.assemble import Assembled
 from calibrate.clouds import Solution
 from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.design_shots import Expectation
 from calibrate.external_result import external_names, external_result
 from calibrate.external_solve import predicted_rms_mm, rms_mm
 from calibrate.identifiability import identifiability_of, parameter_names
+from calibrate.next_poses import Taken, next_best_poses, pose_text, shortcomings
 from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
-from calibrate.verdict import Evidence, judge
+from calibrate.verdict import Evidence, judge, wants_more_poses
 from drivers.files.session import Session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
@@ -64,22 +68,25 @@ def make_result(
     identifiability = identifiability_of(problem, solution)
     names = assembled.sphere_names
     covariance = solution.covariance * scale
-    verdict, reasons = judge(
-        Evidence(
-            limits=cell.limits,
-            cross_validated_rms_mm=held_out_rms,
-            length_expanded_uncertainty_mm=_longest_length_uncertainty(assembled, solution, covariance),
-            n_shots=n_shots,
-            used=used,
-            has_joints=has_joints,
-            # a laser tracker's points are lengths in themselves
-            has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
-            line_profile=line_profile,
-            covariance_scale=scale,
-            external_rms_mm=external_rms if np.isfinite(external_rms) else None,
-        ),
-        identifiability,
+    evidence = Evidence(
+        limits=cell.limits,
+        cross_validated_rms_mm=held_out_rms,
+        length_expanded_uncertainty_mm=_longest_length_uncertainty(assembled, solution, covariance),
+        n_shots=n_shots,
+        used=used,
+        has_joints=has_joints,
+        # a laser tracker's points are lengths in themselves
+        has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
+        line_profile=line_profile,
+        covariance_scale=scale,
+        external_rms_mm=external_rms if np.isfinite(external_rms) else None,
+        shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
+        unseen_branch=unseen_branch(problem, solution, covariance),
     )
+    verdict, reasons = judge(evidence, identifiability)
+    next_poses = _next_poses(cell, assembled, solution) if wants_more_poses(evidence, identifiability) else ()
+    if next_poses:
+        reasons += (f"next best poses: {'; '.join(map(pose_text, next_poses))}",)
     result = Calibration(
         id="",
         method=method,
@@ -124,6 +131,8 @@ def make_result(
         created_utc=created_utc,
         software=software,
         external=external_result(problem, state, datum, covariance, solved.external_held_out_mm, external_predicted),
+        identifiability=identifiability,
+        next_best_poses=next_poses,
     )
     return replace(result, id=str(calibration_data(result)["id"]))
 
@@ -133,6 +142,21 @@ def _all_joints(problem: Problem) -> FloatArray | None:
     if problem.joints_rad is None:
         return None
     return problem.joints_rad if problem.external is None else np.concatenate([problem.joints_rad, problem.external.joints_rad])
+
+
+def _next_poses(cell: Cell, assembled: Assembled, solution: Solution) -> tuple[PlannedPose, ...]:
+    problem, state = assembled.problem, solution.state
+    if problem.model is None or problem.joints_rad is None or not problem.n_shots:
+        return ()
+    taken = Taken(
+        joints_rad=problem.joints_rad,
+        sphere=problem.sphere,
+        names=assembled.sphere_names,
+        centres_in_base_mm=state.centres_in_base_mm,
+        flange_from_camera=state.flange_from_camera,
+        expectation=Expectation(noise=solution.noise, n_points=int(np.median(np.diff(problem.starts))), priors=problem.priors),
+    )
+    return next_best_poses(cell, problem.model, taken)
 
 
 def _predicted_centre_rms(assembled: Assembled, solution: Solution) -> float:

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from acquire.cell import Limits
+from acquire.plan import PlannedPose
 from calibrate.camera_error import CameraError, correction_in_camera_mm
 from calibrate.datum import Datum, datum_jacobian, link_columns, term_columns, twist_columns
 from calibrate.external_result import ExternalResult
+from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
 from calibrate.robot_terms import RobotTerm, deflection_rad, load_basis
@@ -119,6 +121,10 @@ class Calibration:
     """Where `flange_from_camera` comes from: `calibrated`; where only external points were seen, `cell` or `none` (identity)."""
     external: ExternalResult | None = None
     """Frames and targets of external reference points; None where none was seen."""
+    identifiability: Identifiability | None = None
+    """What the shots determined and what not; None in files of older versions."""
+    next_best_poses: tuple[PlannedPose, ...] = ()
+    """Poses that would tell most next, best first, where the verdict asks for more."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -238,6 +244,8 @@ class Calibration:
             "reasons": list(self.reasons),
             "seconds": s.seconds,
             **({} if self.external is None else {"external": self.external.to_json_dict(), "hand_eye": self.hand_eye}),
+            "identifiability": None if self.identifiability is None else self.identifiability.to_json_dict(),
+            "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in self.next_best_poses],
         }
 
     def _shot_covariance(self, points: FloatArray, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None) -> FloatArray:

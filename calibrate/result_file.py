@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from acquire.cell import Limits
+from acquire.plan import PlannedPose
 from calibrate.camera_error import camera_error_from_settings
 from calibrate.datum import Datum
 from calibrate.external_result import external_data, external_from_data
+from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
 from calibrate.robot_terms import RobotTerm
@@ -70,6 +72,8 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "seen_axis_ranges_rad": c.seen_joints_rad,
         "noise": asdict(c.noise),
         "statistics": {key: value for key, value in asdict(c.statistics).items() if key != "seconds"},
+        "identifiability": None if c.identifiability is None else c.identifiability.to_json_dict(),
+        "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in c.next_best_poses],
         "parameters": {
             "names": list(c.parameter_names),
             "sigma": np.sqrt(np.maximum(np.diagonal(c.covariance), 0.0)),
@@ -159,6 +163,9 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         software=str(data["software"]),
         hand_eye=_hand_eye(data.get("hand_eye", "calibrated")),
         external=None if data.get("external") is None else external_from_data(_mapping(data["external"])),
+        # sections that files of older versions lack
+        identifiability=None if data.get("identifiability") is None else Identifiability.from_json_dict(_mapping(data["identifiability"])),
+        next_best_poses=tuple(_pose(_mapping(pose)) for pose in _sequence(data.get("next_best_poses", []))),
     )
 
 
@@ -166,6 +173,10 @@ def _hand_eye(value: object) -> str:
     if value not in ("calibrated", "cell", "none"):
         raise ValueError(f"unknown hand_eye {value!r}")
     return str(value)
+
+
+def _pose(data: Mapping[str, object]) -> PlannedPose:
+    return PlannedPose(str(data["id"]), str(data["sphere"]), _array(data["joints_rad"]))
 
 
 def _term(data: Mapping[str, object]) -> RobotTerm:

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from acquire.cell import Limits
+from calibrate.arm_branches import UnseenBranch
 from calibrate.identifiability import Identifiability
 
 _MANY_REJECTED, _TOO_MANY_REJECTED = 0.1, 0.4
+_SPREAD = "spread the sphere in depth and across the view, and turn the camera about more axes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +30,10 @@ class Evidence:
     covariance_scale: float
     external_rms_mm: float | None = None
     """Rms of held-out external points; None without any."""
+    shortcomings: tuple[str, ...] = ()
+    """What the shots are too few or too alike in, with what to do."""
+    unseen_branch: UnseenBranch | None = None
+    """The best known of the arm's other branches where all shots are of one."""
 
 
 def judge(evidence: Evidence, identifiability: Identifiability) -> tuple[str, tuple[str, ...]]:
@@ -39,13 +45,37 @@ def judge(evidence: Evidence, identifiability: Identifiability) -> tuple[str, tu
     return ("marginal" if marginal else "pass"), tuple(marginal)
 
 
+def wants_more_poses(evidence: Evidence, identifiability: Identifiability) -> bool:
+    """Whether further poses would cure what is held against a calibration."""
+    return identifiability.rank < identifiability.expected_rank or _one_branch(evidence) or _unsure_length(evidence)
+
+
+def _one_branch(e: Evidence) -> bool:
+    return e.limits is not None and e.unseen_branch is not None and e.unseen_branch.expanded_uncertainty_mm > e.limits.length_error_mm
+
+
+def _unsure_length(e: Evidence) -> bool:
+    length = e.length_expanded_uncertainty_mm
+    return e.limits is not None and length is not None and length > e.limits.length_error_mm
+
+
+def _open(identifiability: Identifiability) -> str:
+    named = [group.text.partition(":")[0] for group in identifiability.directions if group.kind == "open" and group.is_known]
+    return f", among them the {' and the '.join(named)}" if named else ""
+
+
 def _grave(e: Evidence, identifiability: Identifiability) -> list[str]:
     found = []
     missing = identifiability.expected_rank - identifiability.rank
     if missing > 0:
         found.append(
-            f"the shots leave {missing} of {identifiability.expected_rank} directions open (rank {identifiability.rank}): "
-            "spread the sphere in depth and across the view, and turn the camera about more axes"
+            f"the shots leave {missing} of {identifiability.expected_rank} directions open (rank {identifiability.rank}){_open(identifiability)}: "
+            + "; ".join(e.shortcomings or (_SPREAD,))
+        )
+    if _one_branch(e) and e.unseen_branch is not None and e.limits is not None:
+        found.append(
+            f"the shots hold the arm in one branch: measured with the {e.unseen_branch.text}, which the robot can, a place would be off by up to "
+            f"U = {e.unseen_branch.expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm: take a third of the shots so"
         )
     rejected = 1 - e.used / max(e.n_shots, 1)
     if rejected > _TOO_MANY_REJECTED:
@@ -66,7 +96,7 @@ def _doubts(e: Evidence) -> list[str]:
         )
     if e.limits is None:
         found.append("no limits given in the cell file: there is nothing to pass against")
-    elif e.length_expanded_uncertainty_mm is not None and e.length_expanded_uncertainty_mm > e.limits.length_error_mm:
+    elif _unsure_length(e):
         found.append(
             f"a length between sphere places has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm"
         )

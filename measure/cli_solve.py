@@ -111,6 +111,9 @@ def calibrate(
         if former is not None:
             run.console.note(f"the earlier {out} was kept as {former}")
         tell_calibration(run.console, calibration, {session.digest: session.folder.name for session in read})
+        if calibration.next_best_poses:
+            run.console.say(f"to take the next best poses: copy the entries of next_best_poses in {out} to poses: of a plan for `spherecal capture`,")
+            run.console.say("and calibrate the old and the new session together")
         run.console.say(f"written to {out}; prove it on other shots: spherecal verify {out} SESSION")
         run.finish({"method": method.value, **calibration.to_json_dict(), "out": out}, verdict=calibration.verdict)
 
