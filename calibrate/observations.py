@@ -139,16 +139,23 @@ def observe(
     else:
         finding = _find(xyz_mm, radius_mm, settings, predicted)
         points, centre = finding.points_in_camera_mm, finding.centre_in_camera_mm
+    return sphere_shot(session, shot, cell=cell, model=model, points_in_camera_mm=points, centre_in_camera_mm=centre)
+
+
+def sphere_shot(
+    session: Session, shot: Shot, *, cell: Cell, model: RobotModel | None, points_in_camera_mm: FloatArray, centre_in_camera_mm: FloatArray | None
+) -> SphereShot:
+    """A shot (with scan and sphere) and the points that were found on its sphere."""
     return SphereShot(
         session=session.digest,
         index=shot.index,
-        sphere=shot.sphere,
-        scan_sha256=shot.sha256,
+        sphere=str(shot.sphere),
+        scan_sha256=str(shot.sha256),
         joints_rad=shot.joints_rad,
         base_from_flange=flange_pose(shot, model),
-        points_in_camera_mm=np.ascontiguousarray(points),
-        radius_mm=radius_mm,
-        centre_in_camera_mm=centre,
+        points_in_camera_mm=np.ascontiguousarray(points_in_camera_mm),
+        radius_mm=cell.spheres[str(shot.sphere)].radius_mm,
+        centre_in_camera_mm=centre_in_camera_mm,
         time_utc=shot.time_utc,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ _PLAUSIBLE_MM = 15.0
 _HOPELESS_MM = 30.0
 _AS_GOOD = 1.2
 _MOST_TRIED_SHOTS = 24
+_LEAST_PER_SPHERE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +63,8 @@ def check_closure(sessions: Sequence[Session], observations: Observations, model
 
 
 def recorded(shots: Sequence[SphereShot], model: RobotModel | None) -> Recorded:
-    """The shots with a centre, of spheres seen often enough to contradict a wrong pose."""
-    names = [shot.sphere for shot in shots]
-    useful = [shot for shot in shots if shot.centre_in_camera_mm is not None and names.count(shot.sphere) >= 3]
+    """The useful ones of some shots as arrays, in their order."""
+    useful = useful_shots(shots)
     spheres, sessions = sorted({s.sphere for s in useful}), sorted({s.session for s in useful})
     with_joints = bool(useful) and model is not None and all(shot.joints_rad is not None for shot in useful)
     return Recorded(
@@ -75,6 +76,13 @@ def recorded(shots: Sequence[SphereShot], model: RobotModel | None) -> Recorded:
         session=np.array([sessions.index(s.session) for s in useful], dtype=np.int64),
         index=np.array([s.index for s in useful], dtype=np.int64),
     )
+
+
+def useful_shots(shots: Sequence[SphereShot]) -> list[SphereShot]:
+    """The shots with a centre, of spheres seen often enough to contradict a wrong pose."""
+    seen = [shot for shot in shots if shot.centre_in_camera_mm is not None]
+    count = Counter(shot.sphere for shot in seen)
+    return [shot for shot in seen if count[shot.sphere] >= _LEAST_PER_SPHERE]
 
 
 def close(data: Recorded) -> Closure:

@@ -53,19 +53,31 @@ def one_hot(sphere: IntArray) -> FloatArray:
     return np.asarray(np.eye(int(sphere.max()) + 1)[sphere])
 
 
-def linear_hand_eye(base_from_flange: FloatArray, centres_in_camera_mm: FloatArray, member: FloatArray) -> FloatArray:
+def linear_hand_eye(
+    base_from_flange: FloatArray, centres_in_camera_mm: FloatArray, member: FloatArray, *, rounds: int = _LINEAR_ROUNDS
+) -> FloatArray:
     """(B, 4, 4) from the reweighted linear system R_j R_X p_j + R_j t_X - c_s = -t_j, its R_X projected on SO(3)."""
-    columns, right = _linear_system(base_from_flange, centres_in_camera_mm, member)
+    unknowns = _linear_unknowns(base_from_flange, centres_in_camera_mm, member, rounds)
+    return se3.from_rotation_translation(se3.nearest_rotation(unknowns[:, :9].reshape(-1, 3, 3)), unknowns[:, 9:12])
+
+
+def linear_matrix(base_from_flange: FloatArray, centres_in_camera_mm: FloatArray, member: FloatArray) -> FloatArray:
+    """(B, 3, 3) that the linear system, each shot weighted equally, puts in the place of R_X: no rotation where data disagree."""
+    return _linear_unknowns(base_from_flange, centres_in_camera_mm, member, 1)[:, :9].reshape(-1, 3, 3) / _LEVER_MM
+
+
+def _linear_unknowns(base_from_flange: FloatArray, centres: FloatArray, member: FloatArray, rounds: int) -> FloatArray:
+    """(B, 12 + 3 S): R_X times the lever, t_X, c."""
+    columns, right = _linear_system(base_from_flange, centres, member)
     weight = np.ones(right.shape[:2])
-    for _ in range(_LINEAR_ROUNDS):
+    for turn in range(rounds):
         weighted = np.swapaxes(columns * weight[..., None, None], 2, 3)
         normal = (weighted @ columns).sum(axis=1)
         normal += 1e-10 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(normal.shape[-1])
         unknowns = np.linalg.solve(normal, (weighted @ right[..., None]).sum(axis=1))[..., 0]
-        miss = np.linalg.norm((columns @ unknowns[:, None, :, None])[..., 0] - right, axis=2)
-        weight = _weights(miss)
-    rotation = se3.nearest_rotation(unknowns[:, :9].reshape(-1, 3, 3))
-    return se3.from_rotation_translation(rotation, unknowns[:, 9:12])
+        if turn + 1 < rounds:
+            weight = _weights(np.linalg.norm((columns @ unknowns[:, None, :, None])[..., 0] - right, axis=2))
+    return np.asarray(unknowns)
 
 
 def refine_closure(base_from_flange: FloatArray, centres_in_camera_mm: FloatArray, member: FloatArray, flange_from_camera: FloatArray) -> Closure:

@@ -86,7 +86,7 @@ def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None
         FileError: a session is broken, or the file cannot be written.
     """
     from acquire.cell import cell_of_session, robot_model_of
-    from calibrate.observations import gather_observations
+    from calibrate.second_look import see_sessions
     from drivers.errors import SettingsError
     from measure.run_scene import scene_of
     from measure.verify import verify
@@ -99,7 +99,7 @@ def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None
     of_spheres = [session for session in sessions if session.purpose != "workpiece"]
     trained = [session for session in of_spheres if is_training(calibration, session)]
     unseen = [session for session in of_spheres if not is_training(calibration, session)]
-    shots = gather_observations(trained, cell=cell, model=robot_model_of(cell, trained[0])).shots if trained else ()
+    shots = see_sessions(trained, cell=cell, model=robot_model_of(cell, trained[0])).shots if trained else ()
     verification = verify(calibration, unseen) if unseen else None
     scene = scene_of(calibration, cell, shots, verification=verification, workpiece=workpieces[0] if workpieces else None)
     write_recording(out, scene)

@@ -17,7 +17,7 @@ from acquire.cell import Cell, load_cell, robot_model_of
 from acquire.events import Command, Event
 from acquire.plan import load_plan, write_plan
 from calibrate import Calibration
-from calibrate.observations import gather_observations
+from calibrate.second_look import see_sessions
 from calibrate.solve import calibrate
 from drivers.files.disk import write_text_atomic
 from drivers.files.session import read_session
@@ -135,7 +135,7 @@ def _write_pictures(folder: Path, cell: Cell, calibration: Calibration, verifica
     sessions = {name: read_session(folder / name) for name in ("calibration", "verification", "workpiece")}
     names = {session.digest: name for name, session in sessions.items()}
     write_report(folder / "report.html", calibration, verification, cell=cell, session_names=names)
-    shots = gather_observations([sessions["calibration"]], cell=cell, model=robot_model_of(cell)).shots
+    shots = see_sessions([sessions["calibration"]], cell=cell, model=robot_model_of(cell)).shots
     cloud = stitched.cloud.points_mm
     scene = scene_of(calibration, cell, shots, verification=verification, workpiece=sessions["workpiece"], stitched_in_base_mm=cloud)
     write_recording(folder / "run.rrd", scene)

@@ -18,7 +18,8 @@ import numpy as np
 
 from acquire.cell import Cell, CertifiedLength, Limits, Sphere, cell_of_session, robot_model_of
 from calibrate.normal import NoiseModel
-from calibrate.observations import Observations, SphereShot, gather_observations
+from calibrate.observations import Observations, SphereShot
+from calibrate.second_look import see_sessions
 from drivers.errors import DataError
 from drivers.files.session import Session
 from drivers.kinematics import se3
@@ -126,7 +127,7 @@ def _training_shots(calibration: JudgedSystem, sessions: Sequence[Session]) -> l
 
 
 def _gather(sessions: Sequence[Session], cells: Sequence[Cell]) -> Observations:
-    parts = [gather_observations([s], cell=c, model=robot_model_of(c, s)) for s, c in zip(sessions, cells, strict=True)]
+    parts = [see_sessions([s], cell=c, model=robot_model_of(c, s)) for s, c in zip(sessions, cells, strict=True)]
     shots = sorted((shot for part in parts for shot in part.shots), key=lambda shot: shot.key)
     rejected = tuple(shot for part in parts for shot in part.rejected)
     if not shots:
