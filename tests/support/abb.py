@@ -18,7 +18,7 @@ from drivers.simulated.truth import Truth
 from tests.support.simulated import exact_camera
 
 TARGETS_DEG = np.array([[0.0, 0.0, 0.0, 0.0, 10.0, 0.0], [15.0, 9.0, -6.0, 12.0, 0.0, -14.321]])
-SPEED_RAD_S = 0.6
+SPEED_RAD_S = 0.9
 
 
 def abb_model() -> RobotModel:
@@ -27,14 +27,14 @@ def abb_model() -> RobotModel:
 
 
 def abb_cell() -> SimulatedCell:
-    """A robot in real time, without any error."""
-    return SimulatedCell(Truth(seed=1, camera=exact_camera()), abb_model(), instant=False)
+    """A robot without any error."""
+    return SimulatedCell(Truth(seed=1, camera=exact_camera()), abb_model())
 
 
 @contextmanager
-def controller(host: str = "127.0.0.1", cell: SimulatedCell | None = None) -> Iterator[AbbController]:
+def controller(*, cell: SimulatedCell | None = None, speed_up: float = 1.0) -> Iterator[AbbController]:
     """A started controller on free ports."""
-    made = AbbController(cell or abb_cell(), host=host, bench_port=0)
+    made = AbbController(cell or abb_cell(), bench_port=0, speed_up=speed_up)
     made.start()
     try:
         yield made

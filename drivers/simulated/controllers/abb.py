@@ -24,6 +24,7 @@ from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.controllers.abb_faults import BUTTONS, WIRE_FAULTS, WireFault, press
 from drivers.simulated.controllers.abb_program import AbbProgram, Identity
 from drivers.simulated.controllers.bench import BENCH_PORT, BenchServer, axes_text
+from drivers.simulated.controllers.holes import BlackHole
 
 POLL_S = 0.1
 LINGER_S = 0.05
@@ -52,13 +53,17 @@ class AbbController:
     """The whole controller; `start` serves in threads until `close`.
 
     Args:
-        cell: the robot, in real time (`instant=False`).
+        cell: the robot; its clock is instant, and goes on with real time.
         host: a loopback address.
         port: of the program that moves; 0 for any free one.
         state_port: of the second program; None for port + 1, or any free one.
         bench_port: 0 for any free one.
         with_pty: whether to offer a serial line, too.
         identity: what it says it is.
+        speed_up: how much faster than real the robot moves.
+
+    Raises:
+        SettingsError: no loopback address, or a port that is taken.
     """
 
     def __init__(
@@ -71,8 +76,12 @@ class AbbController:
         bench_port: int = BENCH_PORT,
         with_pty: bool = True,
         identity: Identity | None = None,
+        speed_up: float = 1.0,
     ) -> None:
-        self.program = AbbProgram(cell, time.monotonic, identity)
+        if not host.startswith("127."):
+            remedy = "Simulated controllers serve 127.0.0.1 to 127.255.255.254 only."
+            raise SettingsError(f"{host} is no loopback address", where="--host", remedy=remedy)
+        self.program = AbbProgram(cell, time.monotonic, identity, speed_up)
         self.host = host
         self._lock = threading.RLock()
         self._fault = WireFault()
@@ -297,14 +306,14 @@ class _Listener:
     def __init__(self, host: str, port: int) -> None:
         self._host = host
         self._socket: socket.socket | None = None
-        self._fillers: list[socket.socket] = []
+        self._hole: BlackHole | None = None
         self.wire: _Wire | None = None
         self.port = port
         self.listen()
 
-    def listen(self, backlog: int = 8) -> None:
+    def listen(self) -> None:
         """Listen again where it had ended, or was a black hole."""
-        if self._socket is not None and not self._fillers:
+        if self._socket is not None:
             return
         self._close_listening()
         listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -315,24 +324,18 @@ class _Listener:
             listening.close()
             remedy = "Choose another address with --host (127.0.0.2 to 127.0.0.254) or another port."
             raise SettingsError(f"{self._host}:{self.port} cannot be listened on ({error.strerror})", remedy=remedy) from error
-        listening.listen(backlog)
+        listening.listen()
         listening.setblocking(False)
         self._socket, self.port = listening, listening.getsockname()[1]
 
     def swallow(self) -> None:
-        """Become a black hole: a queue that is full, so that the kernel drops every further SYN."""
+        """Become a black hole; the open connection stays."""
         self._close_listening()
-        self.listen(backlog=0)
-        for _ in range(3):
-            filler = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            filler.setblocking(False)
-            filler.connect_ex((self._host, self.port))
-            self._fillers.append(filler)
-        time.sleep(0.05)
+        self._hole = BlackHole(self._host, self.port)
 
     def accept(self) -> None:
         """Take a waiting connection, if there is none yet."""
-        if self._socket is None or self.wire is not None or self._fillers:
+        if self._socket is None or self.wire is not None:
             return
         with contextlib.suppress(BlockingIOError):
             connection, _ = self._socket.accept()
@@ -352,9 +355,9 @@ class _Listener:
         self._close_listening()
 
     def _close_listening(self) -> None:
-        for filler in self._fillers:
-            filler.close()
-        self._fillers = []
+        if self._hole is not None:
+            self._hole.close()
+            self._hole = None
         if self._socket is not None:
             self._socket.close()
             self._socket = None

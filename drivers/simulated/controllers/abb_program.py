@@ -89,13 +89,15 @@ class AbbProgram:
     """The program's variables and routines; the caller holds a lock around every call.
 
     Args:
-        cell: the robot.
+        cell: the robot, on a clock of its own (instant), which goes on with `now`.
         now: seconds of a clock that never goes back.
         identity: what it says it is.
+        speed_up: how much faster than real the robot moves.
     """
 
-    def __init__(self, cell: SimulatedCell, now: Callable[[], float], identity: Identity | None = None) -> None:
-        self.cell, self._now = cell, now
+    def __init__(self, cell: SimulatedCell, now: Callable[[], float], identity: Identity | None = None, speed_up: float = 1.0) -> None:
+        self.cell, self._now, self._speed_up = cell, now, speed_up
+        self._ticked_s = now()
         self.identity = identity or Identity()
         self.epoch = 1
         self.n_motions = 0
@@ -151,7 +153,7 @@ class AbbProgram:
             Verb.POSE: lambda _: self._pose(),
             Verb.TARGET: self._take_target,
             Verb.GO: self._go,
-            Verb.LAST: lambda _: (str(self.epoch), f"{self._last_token:04d}", str(int(self._outcome))),
+            Verb.LAST: lambda _: (str(self.epoch), str(self._last_token), str(int(self._outcome))),
             Verb.STOP: lambda _: self._stop(),
         }
         return routines[verb](line)
@@ -219,7 +221,10 @@ class AbbProgram:
         self._outcome = outcome
 
     def tick(self) -> None:
-        """What TRAP SphPoll and the end of MoveAbsJ see: arrival, silence of the computer."""
+        """Let time pass, and what TRAP SphPoll and the end of MoveAbsJ see: arrival, silence of the computer."""
+        now_s = self._now()
+        self.cell.advance((now_s - self._ticked_s) * self._speed_up)
+        self._ticked_s = now_s
         if self.held or not self.moving:
             return
         if not self.cell.moving():
