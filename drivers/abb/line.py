@@ -9,7 +9,7 @@ from drivers.abb.protocol import ANSWERS, LAST_NUMBER, BadLine, Code, Fault, Lin
 from drivers.errors import LinkLost, RobotError, RobotTimeout, WrongController
 from drivers.transport import Link
 
-REPEAT_S = 0.3
+REPEAT_S = 0.2
 """After so long without a reply the same line is sent again; the other side then repeats its words and does nothing."""
 _MOST_FOREIGN_LINES = 3
 
@@ -38,6 +38,11 @@ class Reply:
         return self.came_s - self.asked_s
 
 
+def first_number() -> int:
+    """Where counting begins: not where an earlier connection left off, so that a reply still under way does not fit."""
+    return time.monotonic_ns() // 1_000_000 % LAST_NUMBER
+
+
 class LineClient:
     """The side that asks. One thread owns it; after any error but a Refusal the link is closed."""
 
@@ -61,8 +66,7 @@ class LineClient:
         self.is_open = True
         self._buffer.clear()
         self._foreign = self.n_repeats = 0
-        # not where an earlier connection left off: a reply that is still under way must not fit
-        self._number = time.monotonic_ns() // 1_000_000 % LAST_NUMBER
+        self._number = first_number()
 
     def close(self) -> None:
         """Let go of the link."""

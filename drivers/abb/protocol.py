@@ -159,8 +159,8 @@ class StateReply:
     """N none, E emergency stop, G guard stop, P program error, - unknown."""
 
 
-_LINE = re.compile(r"(\d{4}) ([A-Z]{1,6})((?: [!-)+-~]+)*)\*([0-9A-F]{2})")
-_NUMBER = re.compile(r"-?\d{1,5}(?:\.\d{0,7})?")
+_LINE = re.compile(r"([0-9]{4}) ([A-Z]{1,6})((?: [!-)+-~]+)*)\*([0-9A-F]{2})")
+_NUMBER = re.compile(r"-?[0-9]{1,5}(?:\.[0-9]{0,7})?")
 _FLAGS = re.compile(r"[RMDX][ARFU][01-][NEGP-]")
 
 

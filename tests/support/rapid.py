@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -358,6 +359,7 @@ class _Reader:
         return found
 
 
+@cache
 def read(text: str) -> Module:
     """The module in a text.
 
