@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibrate import normal
 from calibrate.assemble import subset
-from calibrate.clouds import Solution
+from calibrate.clouds import Solution, thinned
 from calibrate.normal import NoiseModel
 from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
 from calibrate.sums import ShotSums, shot_sums
@@ -34,14 +34,17 @@ _NOISE_TOLERANCE = 1e-3
 _LOOSE = 1e-6
 _LEAST_SHARE, _LEVER_MM = 1e-3, 500.0
 _MAX_FIT_PASSES = 25
-_STEP_TOLERANCE_MM = 1e-9
-_ROUND_TOLERANCE_MM = 1e-8
-_FOLD_TOLERANCE_MM = 1e-4
+_STEP_TOLERANCE_MM = 1e-5
+"""Of a Gauss-Newton step: what is left after it is its square over the size of the cell, 1e-12 mm."""
+_ROUND_TOLERANCE_MM = 1e-7
+"""Of a round, of which the next moves a tenth or less."""
 _MAX_STEPS = 30
 _MAX_ROUNDS = 25
-_LAST_ESTIMATE = 6
-"""Rounds in which the noise model is estimated anew; later ones hold it, so that the descent can end."""
-_IN_PLACE_MM, _SWEEPS = 0.05, 2
+_MOST_ESTIMATES, _LATER_ESTIMATES = 4, 2
+"""Rounds in which the noise model may be estimated anew; later ones hold it, so that the descent can end."""
+_IN_PLACE_MM, _FIRST_SWEEPS = 0.05, 4
+_AHEAD_POINTS = 500
+"""Points a shot on which shots of many points are solved first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,21 +156,32 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
         DataError: the rounds do not settle, which means that data and model do not belong together.
     """
     require_centres(problem)
-    state, estimating, known = start, True, None
+    if len(problem.points_in_camera_mm) <= 2 * _AHEAD_POINTS * problem.n_shots:
+        return _rounds(problem, start, noise, ahead=False)
+    ahead = _rounds(thinned(problem, _AHEAD_POINTS), start, noise, ahead=False)
+    return _rounds(problem, ahead.state, ahead.noise, ahead=True)
+
+
+def _rounds(problem: Problem, state: State, noise: NoiseModel, *, ahead: bool) -> Solution:
+    """Fit and solve in turns until neither moves a centre; `ahead` where state and noise are good already."""
     geometry = linearise_geometry(problem, state)
+    known, n_estimates = (noise, _LATER_ESTIMATES) if ahead else (None, _MOST_ESTIMATES)
     for passes in range(1, _MAX_ROUNDS + 1):
+        estimating = passes <= n_estimates
         # one pass a round, from where the last fit is expected, but for the first
         fits, sums = fit_centres(problem, state, geometry, known, _IN_PLACE_MM if known is None else np.inf, patches=estimating)
         before, expected = noise, geometry.centre_in_camera_mm
         if estimating:
             noise = _point_noise(sums, noise, first=known is None)
-        solution = _solve_on(fits, problem, state, noise, estimate_noise=estimating, in_place=known is not None)
+        sweeps = (_FIRST_SWEEPS if known is None else 1) if estimating else 0
+        solution = _solve_on(fits, problem, state, noise, sweeps=sweeps, in_place=known is not None)
         state, noise = solution.state, solution.noise
         geometry, known = replace(solution.geometry, centre_in_camera_mm=fits.centres_at(problem, state)), noise
         moved_mm = float(np.abs(geometry.centre_in_camera_mm - expected).max())
         if not estimating and moved_mm < _ROUND_TOLERANCE_MM:
             return replace(solution, passes=passes)
-        estimating = passes < _LAST_ESTIMATE and not (passes > 1 and _settled(before, noise))
+        if passes > 1 and _settled(before, noise):
+            n_estimates = passes
     raise DataError(
         f"the solve did not settle in {_MAX_ROUNDS} rounds (last change of a centre {moved_mm:.2g} mm)",
         remedy="Check that the robot model, the spheres and the scans belong together; `spherecal centres` shows each shot.",
@@ -177,15 +191,30 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
 def cross_validate_centres(solution: Solution) -> Prediction:
     """Every shot predicted by a solve on the centres of the others; these are not fitted anew, they follow the camera."""
     problem, noise = solution.problem, solution.noise
-    fits, _ = fit_centres(problem, solution.state, solution.geometry, noise)
+    fits = fits_of_solution(solution)
     blind = replace(problem, points_in_camera_mm=problem.points_in_camera_mm[:0], starts=np.zeros_like(problem.starts))
 
     def without(keep: NDArray[np.int64]) -> State:
         training = subset(blind, keep)
         start = replace(solution.state, pose_noise=solution.state.pose_noise[np.unique(problem.scan[keep])])
-        return _solve_on(fits.subset(keep), training, start, noise, estimate_noise=False, tolerance_mm=_FOLD_TOLERANCE_MM).state
+        return _solve_on(fits.subset(keep), training, start, noise).state
 
     return cross_validate(solution, solve=without)
+
+
+def fits_of_solution(solution: Solution) -> CentreFits:
+    """The fits that a solution on centres ended with: its moments hold them whole."""
+    information = solution.moments[:, :3, :3]
+    rest = np.linalg.solve(information, solution.moments[:, :3, 3:])
+    return CentreFits(
+        centre_in_camera_mm=solution.geometry.centre_in_camera_mm + rest[..., -1],
+        information=information,
+        follows=np.asarray(rest[..., :-1]),
+        camera_mm=solution.state.camera_mm,
+        radius_mm=expected_radius_mm(solution.problem, solution.state),
+        n_points=np.diff(solution.problem.starts).astype(np.float64),
+        point_rms_mm=solution.point_rms_mm,
+    )
 
 
 def _point_noise(sums: ShotSums, noise: NoiseModel, *, first: bool) -> NoiseModel:
@@ -202,26 +231,25 @@ def _solve_on(
     state: State,
     noise: NoiseModel,
     *,
-    estimate_noise: bool,
+    sweeps: int = 0,
     in_place: bool = True,
-    tolerance_mm: float = _STEP_TOLERANCE_MM,
 ) -> Solution:
-    """Gauss-Newton on centres alone; while the noise is estimated the last digits are left to a later round.
+    """Gauss-Newton on centres alone; with sweeps of the pose noise the last digits are left to a later round.
 
-    The noise is not estimated before the state is in place: until then all that the start is off would be noise.
+    The pose noise is not estimated before the state is in place: until then all that the start is off would be noise.
     """
     weight = fits.weight(noise)
     for _ in range(_MAX_STEPS):
         geometry = linearise_geometry(problem, state)
         moments = fits.moments(problem, state, geometry)
         linearised = normal.linearise(problem, state, geometry, moments, weight)
-        if estimate_noise and in_place:
-            noise = estimate_pose_noise(linearised, noise, sweeps=_SWEEPS)
+        if sweeps and in_place:
+            noise = estimate_pose_noise(linearised, noise, sweeps=sweeps)
         reduced = normal.reduce(linearised, noise.pose_precision)
         step, noise_step = normal.solve_step(linearised, reduced)
         state = state.moved(problem.layout, step, noise_step)
         step_mm = float(np.abs(geometry.columns[:, :3] @ step).max())
-        if (estimate_noise and in_place) or step_mm < tolerance_mm:
+        if (sweeps and in_place) or step_mm < _STEP_TOLERANCE_MM:
             break
         in_place = step_mm < _IN_PLACE_MM
     return Solution(problem, state, noise, linearised, reduced, geometry, moments, fits.point_rms_mm, 0)

@@ -9,7 +9,7 @@ import pytest
 
 from acquire.sphere_fit import fit_fixed_radius
 from calibrate.camera_error import CameraError, NoCameraError, PillowError, camera_error_models
-from calibrate.centres import CentreFits, cross_validate_centres, fit_centres, solve_centres
+from calibrate.centres import CentreFits, cross_validate_centres, fit_centres, fits_of_solution, solve_centres
 from calibrate.clouds import solve_clouds
 from calibrate.problem import Problem, State, expected_radius_mm, linearise_geometry
 from calibrate.sums import shot_moments
@@ -80,6 +80,17 @@ def test_a_compressed_shot_keeps_what_its_points_say_of_the_centre_and_drops_the
     values = np.linalg.eigvalsh(whole - compressed)
     assert values.min() > -1e-6 * values.max()
     assert values.max() > 1.0
+
+
+def test_a_solution_holds_its_fits() -> None:
+    """Folds take them from its moments instead of the points."""
+    rng = np.random.default_rng(4)
+    problem = problem_of(CELL, draw_shots(CELL, rng, 30, n_points=80), PillowError())
+    solution = solve_centres(problem, start_of(problem, CELL), FIRST_NOISE)
+    held, anew = fits_of_solution(solution), fit_centres(problem, solution.state, solution.geometry, solution.noise)[0]
+    np.testing.assert_allclose(held.centre_in_camera_mm, anew.centre_in_camera_mm, atol=1e-7)
+    np.testing.assert_allclose(held.follows, anew.follows, atol=1e-6)
+    np.testing.assert_allclose(held.information, anew.information, rtol=1e-6, atol=1e-6)
 
 
 def test_without_noise_and_camera_error_both_solvers_agree() -> None:
