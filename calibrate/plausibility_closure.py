@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from calibrate.observations import Observations, SphereShot
+from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.plausibility_causes import Cause, Recorded, causes, shifts
+from calibrate.plausibility_pairs import Pairs, pairs_of, slipped_pairs
 from calibrate.start_closure import LEAST_SHOTS, Closure, fit_closure
 from drivers.errors import DataError
 from drivers.files.session import Session
@@ -33,32 +35,59 @@ class Trial:
     spread_mm: float
 
 
-def check_closure(sessions: Sequence[Session], observations: Observations, model: RobotModel | None) -> None:
+def check_closure(sessions: Sequence[Session], observations: Observations, model: RobotModel | None) -> Mapping[tuple[str, int], str]:
     """Check that one hand-eye transform brings the shots of every sphere to one place.
+
+    Returns:
+        What is to be told of single shots that do not fit, by session and index: whose pose they fit, or which sphere.
 
     Raises:
         DataError: it does not, and a mistake explains why: undone, the spread is five times smaller. Or nothing brings
             the shots within some centimetres; the error then says what was tried.
     """
-    data = recorded(observations.shots, model)
-    if len(data.sphere) < LEAST_SHOTS:
-        return
+    useful, data = useful_shots(observations.shots), recorded(observations.shots, model)
+    if len(useful) < LEAST_SHOTS:
+        return {}
+    file = sessions[0].folder / "shots.jsonl" if sessions else None
     closure = close(data)
     spread_mm = float(closure.spread_mm[0])
     if spread_mm <= CLOSES_MM:
-        return
+        pairs = pairs_of(data, closure)
+        _refuse_slipped(pairs, file)
+        names = sorted({shot.sphere for shot in useful})
+        return {useful[row].key: text for row, text in pairs.told(names).items()}
+    enough_mm = min(spread_mm / _EXPLAINS, _PLAUSIBLE_MM)
     tried = try_causes(data)
-    best = min(tried, key=lambda trial: trial.spread_mm)
-    file = sessions[0].folder / "shots.jsonl" if sessions else None
-    if best.spread_mm <= min(spread_mm / _EXPLAINS, _PLAUSIBLE_MM):
-        equal = [trial for trial in tried if trial.spread_mm <= _AS_GOOD * best.spread_mm]
+    best_mm = min(trial.spread_mm for trial in tried)
+    if best_mm <= enough_mm:
+        equal = [trial for trial in tried if trial.spread_mm <= _AS_GOOD * best_mm]
         raise DataError(_explained(spread_mm, equal), file=file, remedy=equal[0].cause.remedy)
+    slipped = slipped_pairs(data)
+    if slipped is not None and slipped.spread_mm <= enough_mm:
+        _refuse_slipped(slipped, file)
     if spread_mm > _HOPELESS_MM:
         raise DataError(
             f"no hand-eye transform brings the shots of a sphere to one place (they stay {spread_mm:.0f} mm apart), and no single "
-            f"mistake explains it: {len(tried)} were tried ({_kinds(data)}), the best leaves {best.spread_mm:.0f} mm",
+            f"mistake explains it: {len(tried)} were tried ({_kinds(data)}), the best leaves {best_mm:.0f} mm",
             file=file,
             remedy="Check that every scan has the pose at which it was taken, the robot model, and that the spheres stood still.",
+        )
+    return {}
+
+
+def with_hints(rejected: Sequence[RejectedShot], hints: Mapping[tuple[str, int], str]) -> tuple[RejectedShot, ...]:
+    """Rejected shots with what is known of why they do not fit."""
+    return tuple(replace(r, reason=f"{r.reason}; {hints[r.session, r.index]}") if (r.session, r.index) in hints else r for r in rejected)
+
+
+def _refuse_slipped(pairs: Pairs, file: Path | None) -> None:
+    slipped = pairs.slipped()
+    if slipped is not None:
+        raise DataError(
+            f"scans and poses do not belong together: {slipped}; so paired they agree to {pairs.spread_mm:.2f} mm, "
+            f"as recorded {pairs.n_misfits} of {len(pairs.pose_of)} shots do not fit",
+            file=file,
+            remedy="Pair every scan with the pose at which it was taken; a scan that was lost or taken twice moves all later ones.",
         )
 
 

@@ -25,7 +25,7 @@ from calibrate.model_choice import choose_model, is_open
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.plausibility import check_reported_poses
-from calibrate.plausibility_closure import check_closure
+from calibrate.plausibility_closure import check_closure, with_hints
 from calibrate.plausibility_scans import check_units
 from calibrate.problem import Priors, Problem, State
 from calibrate.report_figures import make_result
@@ -109,7 +109,7 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
     if not observations.shots:
         check_units(sessions, cell)
         raise _nothing_to_use(sessions, observations)
-    check_closure(sessions, observations, model)
+    hints = check_closure(sessions, observations, model)
     solved, compared = solve_observations(observations, cell, model, settings)
     return make_result(
         solved,
@@ -119,7 +119,7 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
         n_shots=observations.n_shots,
         notes=notes,
         compared=compared,
-        rejected=observations.rejected + solved.rejected,
+        rejected=with_hints(observations.rejected + solved.rejected, hints),
         created_utc=_now_utc(),
         software=_software(),
         began=began,

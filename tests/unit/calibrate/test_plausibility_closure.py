@@ -187,6 +187,56 @@ def test_a_mistake_in_the_scans_is_named(robot: str, pose_only: bool, mistake: s
         assert words in told(shots, None if pose_only else CELLS[robot].nominal).message, seed
 
 
+def hints(shots: list[SphereShot], model: RobotModel | None) -> dict[int, str]:
+    return {index: text for (_, index), text in check_closure([], Observations(tuple(shots), ()), model).items()}
+
+
+def with_centres_of(shots: list[SphereShot], order: list[int]) -> list[SphereShot]:
+    return with_centres(shots, lambda centres: centres[order])
+
+
+@pytest.mark.parametrize("pose_only", [False, True], ids=["joints", "poses"])
+@pytest.mark.parametrize("robot", CELLS)
+def test_exchanged_shots_are_named_both(robot: str, pose_only: bool) -> None:
+    for seed in SEEDS:
+        shots = shots_of(robot, seed, pose_only=pose_only)
+        order = list(range(24))
+        order[4], order[17], order[9], order[12] = 17, 4, 12, 9
+        found = hints(with_centres_of(shots, order), None if pose_only else CELLS[robot].nominal)
+        assert sorted(found) == [4, 9, 12, 17]
+        for one, other in ((4, 17), (17, 4), (9, 12), (12, 9)):
+            assert f"fits the pose of shot {other} and the other way round" in found[one]
+
+
+def test_three_shots_that_went_round_are_told_one_by_one() -> None:
+    order = list(range(24))
+    order[3], order[8], order[15] = 8, 15, 3
+    found = hints(with_centres_of(shots_of("ur10e", 5), order), UR10E)
+    assert {index: text.split("shot ")[1] for index, text in found.items()} == {3: "8", 8: "15", 15: "3"}
+
+
+def test_a_scan_of_another_sphere_is_told() -> None:
+    other = replace(CELLS["ur10e"], centre_in_base_mm=np.array([640.0, 180.0, 340.0]))
+    shots = shots_of("ur10e", 101, 12) + [
+        replace(s, index=s.index + 12, sphere="B", scan_sha256=f"b{s.index}") for s in shots_of("ur10e", 101, 12, cell=other)
+    ]
+    shots[5] = replace(shots[5], sphere="B")
+    assert hints(shots, UR10E) == {5: "its scan shows sphere A"}
+
+
+@pytest.mark.parametrize("begins", [3, 8, 12, 16])
+@pytest.mark.parametrize("by", [1, -1])
+def test_a_list_that_slips_midway_is_told_from_which_shot_on(begins: int, by: int) -> None:
+    """A scan that was lost (+1) or taken twice (-1)."""
+    for robot, cell in CELLS.items():
+        shots = shots_of(robot, 102, 24)
+        order = [i if i < begins else min(max(i + by, 0), 23) for i in range(24)]
+        message = told(with_centres_of(shots, order), cell.nominal).message
+        named = f"shots {begins} to " in message or ("shifted by one shot" in message and begins < 5)
+        assert named, (robot, message)
+        assert f"i{by:+d}" in message
+
+
 @pytest.mark.parametrize("n", [8, 10, 15])
 @pytest.mark.parametrize("robot", CELLS)
 def test_a_mistake_is_named_in_few_shots_of_which_one_is_bad(robot: str, n: int) -> None:
@@ -215,7 +265,7 @@ def test_right_data_raise_no_alarm(robot: str, n: int, seed: int) -> None:
     shots = shots_of(robot, seed, n, cell=cell)
     for i in rng.choice(n, max(1, n // 10), replace=False):
         shots[i] = replace(shots[i], centre_in_camera_mm=shots[i].centre_in_camera_mm + rng.normal(0, 100, 3))
-    check_closure([], Observations(tuple(shots), ()), cell.nominal)
+    assert check_closure([], Observations(tuple(shots), ()), cell.nominal) == {}
     data = recorded(shots, cell.nominal)
     # even where nothing obliges it to try, no mistake would explain right data much better than none
     assert min(t.spread_mm for t in try_causes(data)) > 0.4 * close(data).spread_mm[0]
