@@ -21,7 +21,12 @@ ROBOT_GROUP = "spherecal.robots"
 CAMERA_GROUP = "spherecal.cameras"
 
 _BUILT_IN: dict[str, dict[str, str]] = {
-    ROBOT_GROUP: {"simulated": "drivers.simulated:make_robot", "recorded": "drivers.recorded:make_robot", "abb_socket": "drivers.abb:make_robot"},
+    ROBOT_GROUP: {
+        "simulated": "drivers.simulated:make_robot",
+        "recorded": "drivers.recorded:make_robot",
+        "ur_rtde": "drivers.ur_rtde:make_robot",
+        "abb_socket": "drivers.abb:make_robot",
+    },
     CAMERA_GROUP: {"simulated": "drivers.simulated:make_camera", "recorded": "drivers.recorded:make_camera"},
 }
 

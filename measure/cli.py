@@ -14,6 +14,7 @@ import typer
 
 from measure.cli_capture import capture
 from measure.cli_cell import doctor, new_cell
+from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
 from measure.cli_export import export
 from measure.cli_measure import stitch, verify
@@ -50,6 +51,7 @@ app.command("report")(report)
 app.command("show")(show)
 app.command("study")(study)
 app.command("export")(export)
+app.command("simulate-controller")(simulate_controller)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,0 +1,1 @@
+"""Universal Robots over RTDE, with the package `ur-rtde` in a child process: see `drivers.ur_rtde`."""
