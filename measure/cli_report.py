@@ -74,7 +74,8 @@ def show(
 def is_training(calibration: Calibration, session: Session) -> bool:
     """Whether a calibration was made from shots of this session."""
     known = {shot.scan_sha256 for shot in calibration.shots}
-    return any(shot.sha256 in known for shot in session.shots)
+    external = () if calibration.external is None else calibration.external.shots
+    return any(shot.sha256 in known for shot in session.shots) or any(shot.session == session.digest for shot in external)
 
 
 def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None:

@@ -66,9 +66,9 @@ def examine(cell: Cell, *, offline: bool) -> Diagnosis:
 def cell_problems(cell: Cell, model: RobotModel | None) -> list[str]:
     """What makes a plan or a calibration impossible."""
     problems = []
-    if not cell.spheres:
+    if not cell.spheres and model is None:
         problems.append(f"{cell.path}, spheres: there is none. Add the certified diameter of at least one sphere.")
-    if model is not None and cell.flange_from_camera is None:
+    if cell.spheres and model is not None and cell.flange_from_camera is None:
         problems.append(f"{cell.path}, flange_from_camera: no first guess, so no poses can be planned. A drawing's figures will do.")
     return problems
 
@@ -76,9 +76,11 @@ def cell_problems(cell: Cell, model: RobotModel | None) -> list[str]:
 def cell_hints(cell: Cell, model: RobotModel | None) -> list[str]:
     """What a good cell has and this one lacks."""
     hints = []
+    if not cell.spheres and model is not None:
+        hints.append("spheres: there is none, so the robot alone can be calibrated, on external reference points (a laser tracker)")
     if cell.limits is None:
         hints.append("limits: none given, so no verdict can be better than marginal")
-    if not cell.lengths:
+    if cell.spheres and not cell.lengths:
         hints.append("lengths: no certified length, so the scale hangs on the sphere's radius alone; one ball bar cuts the error by more than half")
     if model is None:
         hints.append("robot.model: none, so flange poses are taken as the robot reports them and its own errors stay")

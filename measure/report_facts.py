@@ -102,11 +102,34 @@ def _artefacts(cell: Cell | None) -> Iterator[tuple[str, str]]:
 def _identity(calibration: Calibration) -> Iterator[tuple[str, str]]:
     yield "calibrated", f"{calibration.created_utc} by {calibration.software}"
     yield "robot model", "none: flange poses as the controller reports them" if calibration.model is None else calibration.model.name
+    yield from _external(calibration)
     yield from _flat(calibration.identity, "")
     yield from ((f"input {key}", value) for key, value in _flat(calibration.inputs, ""))
     if calibration.seen_joints_rad is not None:
         low, high = np.degrees(calibration.seen_joints_rad)
         yield "axis ranges used", ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in zip(low, high, strict=True))
+
+
+def _external(calibration: Calibration) -> Iterator[tuple[str, str]]:
+    external = calibration.external
+    if external is None:
+        return
+    if calibration.hand_eye != "calibrated":
+        source = "the cell file's" if calibration.hand_eye == "cell" else "nothing is known of it"
+        yield "hand-eye transform and camera", f"not calibrated, for no sphere was seen: {source}"
+    left_out = external.cross_validated_rms_mm
+    missed = "" if left_out is None else f", missed by {left_out:.3f} mm rms when left out"
+    yield "external reference points", f"{len(external.shots)} used{missed}"
+    for name, frame in external.references.items():
+        sigma_mm = float(np.sqrt(np.trace(frame.covariance[:3, :3])))
+        yield f"external reference {name}", f"origin at {_place(frame.base_from_reference[:3, 3])} in the base, 1 sigma {sigma_mm:.3f} mm there"
+    for name, target in external.targets.items():
+        sigma_mm = float(np.sqrt(np.trace(target.covariance_mm2)))
+        yield f"external target {name}", f"{_place(target.point_in_flange_mm)} in the flange, 1 sigma {sigma_mm:.3f} mm"
+
+
+def _place(point_mm: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in point_mm) + ") mm"
 
 
 def _flat(value: object, path: str) -> Iterator[tuple[str, str]]:

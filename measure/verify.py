@@ -18,7 +18,7 @@ import numpy as np
 
 from acquire.cell import Cell, CertifiedLength, Limits, Sphere, cell_of_session, robot_model_of
 from calibrate.normal import NoiseModel
-from calibrate.observations import Observations, SphereShot
+from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.second_look import see_sessions
 from drivers.errors import DataError
 from drivers.files.session import Session
@@ -37,6 +37,7 @@ _SAME_POSE_MM, _SAME_POSE_RAD = 5.0, 0.02
 """Flange poses nearer than this are the same pose of the robot, taught twice or repeated."""
 
 _LEAST_VIEWS = 2
+_EXTERNAL = "external reference point: verification looks at spheres through the camera"
 
 
 def verify(
@@ -129,7 +130,11 @@ def _training_shots(calibration: JudgedSystem, sessions: Sequence[Session]) -> l
 def _gather(sessions: Sequence[Session], cells: Sequence[Cell]) -> Observations:
     parts = [see_sessions([s], cell=c, model=robot_model_of(c, s)) for s, c in zip(sessions, cells, strict=True)]
     shots = sorted((shot for part in parts for shot in part.shots), key=lambda shot: shot.key)
-    rejected = tuple(shot for part in parts for shot in part.rejected)
+    external = tuple(RejectedShot(shot.session, shot.index, _EXTERNAL) for part in parts for shot in part.external)
+    rejected = tuple(shot for part in parts for shot in part.rejected) + external
+    if not shots and len(external) == len(rejected) > 0:
+        remedy = "Name a session with shots of spheres; `spherecal calibrate` itself judges the robot on points left out."
+        raise DataError("the session holds external reference points alone; verification looks at spheres", file=sessions[0].folder, remedy=remedy)
     if not shots:
         why = f"; the first refusal was: {rejected[0].reason}" if rejected else ""
         raise DataError(f"none of {len(rejected)} shots shows a sphere{why}", file=sessions[0].folder, remedy="Capture shots of the spheres.")
