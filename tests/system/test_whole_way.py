@@ -45,6 +45,19 @@ def test_calibrate_tells_the_contracts_keys(small: SmallCell, calibration: Path,
     assert list(tmp_path.iterdir()) == [out]  # the same content again: the earlier file needs no keeping
 
 
+def test_calibrate_by_centres_tells_the_same_keys_and_its_method(small: SmallCell, calibration: Path, tmp_path: Path, cli: Cli) -> None:
+    out = tmp_path / "centres.yaml"
+    result = cli("calibrate", small.calibration_session, "-o", out, "--method", "centres", "--camera-error", "pillow", "--json")
+    assert result.code == 0, result.err
+    told = result.told
+    assert (told["method"], told["camera_error"]) == ("centres", "pillow")
+    assert told["n_shots"] == told["used"] + len(told["rejected"]) == N_CALIBRATION
+    assert told["cross_validated_rms_mm"] < 0.2
+    assert "method: centres" in out.read_text()
+    verified = cli("verify", out, small.verification_session, "--json").told
+    by_clouds = cli("verify", calibration, small.verification_session, "--json").told
+    assert verified["centre_rms_mm"] < 1.5 * by_clouds["centre_rms_mm"]
+
 
 def test_verify_beats_the_uncalibrated_cell_on_lengths_it_never_saw(small: SmallCell, calibration: Path, cli: Cli) -> None:
     result = cli("verify", calibration, small.verification_session, "--json")
