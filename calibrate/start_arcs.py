@@ -1,74 +1,146 @@
-"""A first guess from line profiles: many starts, since one arc leaves the side of its plane open (METHOD.md 5)."""
+"""A first guess from line profiles: many starts, since one arc leaves the side of its plane open (METHOD.md 5).
+
+All starts are refined side by side (Levenberg-Marquardt on thinned-out arcs). A given guess that leads to a good fit
+near itself is taken without them.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from calibrate.problem import IntArray, Problem, State
+from calibrate.problem import IntArray, Problem
 from calibrate.start import Start, initial_state
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _N_STARTS = 48
-_POINTS_PER_ARC = 24
+_POINTS_PER_ARC = 16
+_ROUNDS, _FINALISTS, _FINAL_ROUNDS = 25, 6, 60
+_LEVER_MM = 300.0
+_GOOD_MM, _NEAR_MM, _NEAR_RAD = 0.5, 100.0, 0.35
+_ENOUGH_ARCS = 12
+"""With fewer a wrong solution may fit as well, and all starts are compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arcs:
+    """Thinned-out arcs: N points of m shots on S spheres."""
+
+    base_from_flange: FloatArray
+    """(N, 4, 4) of each point's shot."""
+    points_in_camera_mm: FloatArray
+    """(N, 3)"""
+    member: FloatArray
+    """(N, S), 1 for the point's sphere."""
+    radius_mm: FloatArray
+    """(N,)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fits:
+    """B solutions."""
+
+    flange_from_camera: FloatArray
+    """(B, 4, 4)"""
+    centres_in_base_mm: FloatArray
+    """(B, S, 3)"""
+    rms_mm: FloatArray
+    """(B,)"""
+
+    def part(self, rows: IntArray) -> _Fits:
+        return _Fits(self.flange_from_camera[rows], self.centres_in_base_mm[rows], self.rms_mm[rows])
 
 
 def start_from_arcs(problem: Problem, guess: FloatArray | None, seed: int = 7447) -> Start:
-    """The best of many local solves for hand-eye and centres on thinned-out arcs, every other error at zero.
+    """The best of many local solves for hand-eye and centres, every other error at zero; of one where the guess is good.
 
     Raises:
         DataError: fewer than six arcs.
     """
-    from scipy.optimize import least_squares
-
     if problem.n_shots < 6:
         raise DataError(
             f"{problem.n_shots} profiles are too few", remedy="Take at least 12 profiles of the sphere, turned and shifted in all directions."
         )
-    points, shot = _thinned(problem)
-    n_spheres = len(problem.radius_mm)
-
-    def unpack(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return se3.from_rotation_translation(se3.exp_so3(x[:3]), x[3:6]), x[6:].reshape(n_spheres, 3)
-
-    def residuals(x: FloatArray) -> FloatArray:
-        hand_eye, centres = unpack(x)
-        in_base = se3.apply((problem.base_from_flange @ hand_eye)[shot], points)
-        return np.asarray(np.linalg.norm(in_base - centres[problem.sphere[shot]], axis=1) - problem.radius_mm[problem.sphere[shot]])
-
-    best_x, best_cost = None, np.inf
-    for first in _starts(problem, points, shot, guess, np.random.default_rng(seed)):
-        found = least_squares(residuals, first, method="lm", max_nfev=600)
-        if found.cost < best_cost:
-            best_x, best_cost = np.asarray(found.x), float(found.cost)
-    if best_x is None:  # pragma: no cover - _starts always yields
-        raise DataError("no first guess", remedy="Give flange_from_camera in the cell file.")
-    hand_eye, centres = unpack(best_x)
-    state: State = initial_state(problem, hand_eye, centres)
-    return Start(state, np.zeros(problem.n_shots), float(np.sqrt(2 * best_cost / len(points))))
+    arcs, mean = _thinned(problem)
+    if guess is not None:
+        guessed = _refined(arcs, _start(problem, mean, guess[None, :3, :3]), _FINAL_ROUNDS)
+        if problem.n_shots >= _ENOUGH_ARCS and _is_good(guessed, guess):
+            return _as_start(problem, guessed)
+    quaternions = np.random.default_rng(seed).normal(size=(_N_STARTS, 4))
+    fits = _refined(arcs, _start(problem, mean, _rotation_of_quaternion(quaternions)), _ROUNDS)
+    fits = _refined(arcs, fits.part(np.argsort(fits.rms_mm, kind="stable")[:_FINALISTS]), _FINAL_ROUNDS)
+    fits = fits.part(np.argsort(fits.rms_mm, kind="stable")[:1])
+    return _as_start(problem, fits if guess is None or fits.rms_mm[0] < guessed.rms_mm[0] else guessed)
 
 
-def _starts(problem: Problem, points: FloatArray, shot: IntArray, guess: FloatArray | None, rng: np.random.Generator) -> list[FloatArray]:
-    """Random orientations, each with the linear solution for translation and centres when points stood for centres."""
-    rotations = [] if guess is None else [guess[:3, :3]]
-    quaternions = rng.normal(size=(_N_STARTS, 4))
-    rotations += list(_rotation_of_quaternion(quaternions))
-    return [_linear_rest(problem, points, shot, rotation) for rotation in rotations]
+def _is_good(fits: _Fits, guess: FloatArray) -> bool:
+    off = se3.log(se3.inverse(guess) @ fits.flange_from_camera[0])
+    return bool(fits.rms_mm[0] < _GOOD_MM and np.linalg.norm(off[:3]) < _NEAR_MM and np.linalg.norm(off[3:]) < _NEAR_RAD)
 
 
-def _linear_rest(problem: Problem, points: FloatArray, shot: IntArray, rotation: FloatArray) -> FloatArray:
-    mean = np.stack([points[shot == j].mean(axis=0) for j in range(problem.n_shots)])
-    flange = problem.base_from_flange
-    n_spheres = len(problem.radius_mm)
-    columns = np.zeros((problem.n_shots, 3, 3 + 3 * n_spheres))
+def _as_start(problem: Problem, fits: _Fits) -> Start:
+    state = initial_state(problem, fits.flange_from_camera[0], fits.centres_in_base_mm[0])
+    return Start(state, np.zeros(problem.n_shots), float(fits.rms_mm[0]))
+
+
+def _start(problem: Problem, mean_in_camera_mm: FloatArray, rotations: FloatArray) -> _Fits:
+    """For rotations (B, 3, 3) the linear solution of translation and centres when each arc's mean (m, 3) stood for the centre."""
+    flange, n_spheres, m = problem.base_from_flange, len(problem.radius_mm), problem.n_shots
+    columns = np.zeros((m, 3, 3 + 3 * n_spheres))
     columns[:, :, :3] = flange[:, :3, :3]
-    rows = np.arange(problem.n_shots)
     for axis in range(3):
-        columns[rows, axis, 3 + 3 * problem.sphere + axis] = -1.0
-    right = -(flange[:, :3, 3] + np.einsum("mij,jk,mk->mi", flange[:, :3, :3], rotation, mean))
-    solution = np.linalg.lstsq(columns.reshape(-1, 3 + 3 * n_spheres), right.reshape(-1), rcond=1e-6)[0]
-    return np.concatenate([se3.log_so3(rotation), solution])
+        columns[np.arange(m), axis, 3 + 3 * problem.sphere + axis] = -1.0
+    turned = np.einsum("mij,bjk,mk->bmi", flange[:, :3, :3], rotations, mean_in_camera_mm)
+    right = -(flange[:, :3, 3] + turned).reshape(len(rotations), -1)
+    solution = np.linalg.lstsq(columns.reshape(3 * m, -1), right.T, rcond=1e-6)[0].T
+    return _Fits(
+        se3.from_rotation_translation(rotations, solution[:, :3]), solution[:, 3:].reshape(-1, n_spheres, 3), np.full(len(rotations), np.inf)
+    )
+
+
+def _refined(arcs: _Arcs, fits: _Fits, rounds: int) -> _Fits:
+    """Levenberg-Marquardt of every solution by itself."""
+    damping = np.full(len(fits.rms_mm), 1e-3)
+    best, rows, residual = _linearised(arcs, fits)
+    for _ in range(rounds):
+        normal = np.swapaxes(rows, 1, 2) @ rows
+        diagonal = np.einsum("bkk->bk", normal)
+        damped = normal + ((damping[:, None] * diagonal) + 1e-9 * diagonal.max(axis=1)[:, None])[:, :, None] * np.eye(normal.shape[1])
+        step = -np.linalg.solve(damped, np.swapaxes(rows, 1, 2) @ residual[..., None])[..., 0]
+        tried, tried_rows, tried_residual = _linearised(arcs, _moved(best, step))
+        better = tried.rms_mm < best.rms_mm
+        damping = np.clip(np.where(better, damping * 0.2, damping * 5.0), 1e-9, 1e6)
+        if not better.any() and damping.min() > 1e3:
+            break
+        best = _Fits(
+            np.where(better[:, None, None], tried.flange_from_camera, best.flange_from_camera),
+            np.where(better[:, None, None], tried.centres_in_base_mm, best.centres_in_base_mm),
+            np.where(better, tried.rms_mm, best.rms_mm),
+        )
+        rows = np.where(better[:, None, None], tried_rows, rows)
+        residual = np.where(better[:, None], tried_residual, residual)
+    return best
+
+
+def _moved(fits: _Fits, step: FloatArray) -> _Fits:
+    twist = step[:, :6] / [1, 1, 1, _LEVER_MM, _LEVER_MM, _LEVER_MM]
+    return _Fits(se3.exp(twist) @ fits.flange_from_camera, fits.centres_in_base_mm + step[:, 6:].reshape(fits.centres_in_base_mm.shape), fits.rms_mm)
+
+
+def _linearised(arcs: _Arcs, fits: _Fits) -> tuple[_Fits, FloatArray, FloatArray]:
+    """The solutions with their rms, derivatives (B, N, 6 + 3 S) by left twist and centres, residuals (B, N) `|W - c| - R`."""
+    in_flange = se3.apply(fits.flange_from_camera[:, None], arcs.points_in_camera_mm)
+    away = se3.apply(arcs.base_from_flange, in_flange) - arcs.member @ fits.centres_in_base_mm
+    distance = np.linalg.norm(away, axis=2)
+    outward = away / np.maximum(distance, 1e-9)[..., None]
+    in_flange_axes = (outward[..., None, :] @ arcs.base_from_flange[:, :3, :3])[..., 0, :]
+    by_centres = -(arcs.member[..., None] * outward[:, :, None, :]).reshape(*distance.shape, -1)
+    rows = np.concatenate([in_flange_axes, np.cross(in_flange, in_flange_axes) / _LEVER_MM, by_centres], axis=-1)
+    residual = distance - arcs.radius_mm
+    return _Fits(fits.flange_from_camera, fits.centres_in_base_mm, np.sqrt((residual**2).mean(axis=1))), rows, residual
 
 
 def _rotation_of_quaternion(wxyz: FloatArray) -> FloatArray:
@@ -78,10 +150,11 @@ def _rotation_of_quaternion(wxyz: FloatArray) -> FloatArray:
     return se3.exp_so3(axis * angle[:, None])
 
 
-def _thinned(problem: Problem) -> tuple[FloatArray, IntArray]:
-    """Points (k, 3) and their shot (k,), evenly along each arc."""
-    chosen = [
-        np.linspace(a, b - 1, min(_POINTS_PER_ARC, b - a)).astype(np.int64) for a, b in zip(problem.starts[:-1], problem.starts[1:], strict=True)
-    ]
-    shot = np.repeat(np.arange(problem.n_shots), [len(c) for c in chosen])
-    return problem.points_in_camera_mm[np.concatenate(chosen)], shot.astype(np.int64)
+def _thinned(problem: Problem) -> tuple[_Arcs, FloatArray]:
+    """Some points evenly along each arc, and the mean (m, 3) of each arc."""
+    ends = zip(problem.starts[:-1], problem.starts[1:], strict=True)
+    chosen = [np.linspace(a, b - 1, min(_POINTS_PER_ARC, b - a)).astype(np.int64) for a, b in ends]
+    shot = np.repeat(np.arange(problem.n_shots), [len(rows) for rows in chosen])
+    points, sphere = problem.points_in_camera_mm[np.concatenate(chosen)], problem.sphere[shot]
+    arcs = _Arcs(problem.base_from_flange[shot], points, np.eye(len(problem.radius_mm))[sphere], problem.radius_mm[sphere])
+    return arcs, np.array([problem.points_in_camera_mm[rows].mean(axis=0) for rows in chosen])
