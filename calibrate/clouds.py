@@ -56,14 +56,14 @@ class Solution:
         covariance is inv(H_xx) + S Q S' and the cross covariance S Q, Q the prior of c.
         """
         layout = self.problem.layout
-        if self.problem.estimate_terms or not layout.n_terms:
-            return normal.symmetric_inverse(self.reduced.hessian)
         held = np.zeros(layout.size, dtype=bool)
-        held[layout.terms] = True
+        held[layout.terms] = ~self.problem.free_terms
+        if not held.any():
+            return normal.symmetric_inverse(self.reduced.hessian)
         free = ~held
         inverse = normal.symmetric_inverse(self.reduced.hessian[np.ix_(free, free)])
         follows = -inverse @ self.reduced.hessian[np.ix_(free, held)]
-        variance = self.problem.priors.term_sigma_rad(self.problem.terms) ** 2
+        variance = self.problem.priors.term_sigma_rad(self.problem.terms)[~self.problem.free_terms] ** 2
         result = np.zeros((layout.size, layout.size))
         result[np.ix_(free, free)] = inverse + follows * variance @ follows.T
         result[np.ix_(free, held)] = follows * variance

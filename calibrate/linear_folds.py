@@ -9,12 +9,14 @@ micrometre. Against ten solves each, held-out rms agreed to 2 % for every model,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate import normal
-from calibrate.camera_error_stack import Columns, StackedModels
+from calibrate.camera_error import CameraError
+from calibrate.camera_error_stack import Columns
 from calibrate.external import external_rows, joined
 from calibrate.normal import Linearised, NoiseModel, Reduced
 from calibrate.problem import Geometry, Problem, State, linearise_geometry
@@ -27,6 +29,14 @@ IntArray = NDArray[np.int64]
 
 _JITTER = 1e-12
 """Of the scaled diagonal: far below any prior, far above rounding."""
+
+
+class StackableError(CameraError, Protocol):
+    """Camera terms whose priors come with a choice among them."""
+
+    def coefficients_mm(self, model: CameraError, camera_mm: FloatArray) -> FloatArray:
+        """(k,) all coefficients, those of one model given."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +66,7 @@ class Folds:
     """(m,) shots whose sphere other folds show too."""
 
 
-def linear_folds(problem: Problem, state: State, noise: NoiseModel, fold: IntArray, stacked: StackedModels) -> Folds:
+def linear_folds(problem: Problem, state: State, noise: NoiseModel, fold: IntArray, stacked: StackableError) -> Folds:
     """Linearise about a state with the terms of `stacked`.
 
     Args:

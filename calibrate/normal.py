@@ -219,7 +219,7 @@ def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     precision[layout.camera] = problem.camera_error.prior_sigma_mm**-2.0
     value[layout.camera] = state.camera_mm
     # terms that are not estimated are held by a prior that no data can move
-    precision[layout.terms] = priors.term_sigma_rad(problem.terms) ** -2.0 if problem.estimate_terms else _HELD_RAD**-2
+    precision[layout.terms] = np.where(problem.free_terms, priors.term_sigma_rad(problem.terms) ** -2.0, _HELD_RAD**-2)
     value[layout.terms] = state.terms_rad
     precision[layout.radius_offset] = priors.radius_offset_mm**-2
     value[layout.radius_offset] = state.radius_offset_mm

@@ -43,9 +43,13 @@ class Priors:
     transmission_rad: float = 3e-5
     """Amplitude of an axis' transmission error."""
 
+    estimated_rad: float = 1e-3
+    """Of a term that is estimated, because held-out shots want it."""
+
     def term_sigma_rad(self, terms: tuple[RobotTerm, ...]) -> FloatArray:
         """(K,) of deflection terms."""
-        return np.array([self.deflection_rad if term.kind == "compliance" else self.transmission_rad for term in terms])
+        considered = {"compliance": self.deflection_rad}
+        return np.array([self.estimated_rad if term.estimated else considered.get(term.kind, self.transmission_rad) for term in terms])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +90,6 @@ class Problem:
     """Deflection terms of the arm, K of them."""
     load: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
     """(m, n, K) of the terms."""
-    estimate_terms: bool = False
-    """Whether the terms are unknowns of the solve; else they stay zero and are only considered in the covariance."""
     first_flange_from_camera: FloatArray | None = None
     """(4, 4) the start's hand-eye transform: a far and weak hold where the shots leave the camera's orientation open."""
     along_sight: bool = True
@@ -105,6 +107,11 @@ class Problem:
         """Number of scans G, each with its own pose noise; stops at which external points were seen come last."""
         n_stops = 0 if self.external is None else self.external.n_stops
         return (int(self.scan.max()) + 1 if self.n_shots else 0) + n_stops
+
+    @property
+    def free_terms(self) -> NDArray[np.bool_]:
+        """(K,) deflection terms that are unknowns of the solve."""
+        return np.array([term.estimated for term in self.terms], dtype=bool)
 
     @property
     def layout(self) -> Layout:

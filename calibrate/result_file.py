@@ -58,7 +58,7 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "robot_model": None if c.model is None else robot_model_data(c.model),
         "link_twists": c.link_twists,
         "robot_terms": [
-            {"kind": t.kind, "axis": t.axis + 1, "order": t.order, "coefficient_rad": float(value)}
+            {"kind": t.kind, "axis": t.axis + 1, "order": t.order, "estimated": t.estimated, "coefficient_rad": float(value)}
             for t, value in zip(c.terms, c.terms_rad, strict=True)
         ],
         "flange_from_camera": c.flange_from_camera,
@@ -181,8 +181,8 @@ def _pose(data: Mapping[str, object]) -> PlannedPose:
 
 def _term(data: Mapping[str, object]) -> RobotTerm:
     match data["kind"]:
-        case "compliance" | "sine" | "cosine" as kind:
-            return RobotTerm(kind, int(str(data["axis"])) - 1, int(str(data["order"])))
+        case "compliance" | "sine" | "cosine" | "tangent" | "secant" as kind:
+            return RobotTerm(kind, int(str(data["axis"])) - 1, int(str(data["order"])), data.get("estimated") is True)
         case other:
             raise ValueError(f"unknown robot term {other!r}")
 

@@ -1,9 +1,13 @@
 """Robot physics beyond constant link twists: axes that yield under gravity, and errors of their transmissions.
 
-Each term adds `coefficient * shape(q)` to the angle of one axis. Compliance: the shape is gravity's torque about the
-axis for a mass at one place of the arm, in units of the torque at full horizontal stretch, so that the coefficient is
-the deflection in rad there (compliance models with a few stiffnesses: Nubiola and Bonev 2013; Icli and Bonev 2020).
-Transmission: sine and cosine of the axis angle, once a turn (eccentric gears and encoders).
+Each term adds `coefficient * shape(q)` to the angle of one axis (transmissions: to what that axis' motor drives).
+Compliance: the shape is gravity's torque about the axis for a mass at one place of the arm, in units of the torque at full
+horizontal stretch, so that the coefficient is the deflection in rad there (compliance models with a few stiffnesses:
+Nubiola and Bonev 2013; Icli and Bonev 2020).
+Transmission: sine and cosine of the axis angle, once a turn or more often (eccentric gears and encoders, teeth).
+Linkage: a parallelogram drives an axis, and its bars are not of equal length in pairs. With x the angle by which the
+cranks are away from square to the arm, closing the four bars gives to first order
+`(crank difference tan x - rod difference / cos x) / crank`.
 
 A term is estimated only where held-out shots want it. Where they do not, it is *considered* (Schmidt's consider
 parameters): its coefficient stays zero and its prior goes into the covariance, so that lengths at places with another
@@ -12,7 +16,7 @@ load carry what is not known of the arm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,7 +26,12 @@ from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
-TermKind = Literal["compliance", "sine", "cosine"]
+HIGHEST_ORDER = 30
+"""Cycles per turn up to which errors of a transmission are looked for."""
+_STRETCHED_RAD = 1.3
+"""A parallelogram folds up beyond this; robots keep away from it."""
+
+TermKind = Literal["compliance", "sine", "cosine", "tangent", "secant"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +42,14 @@ class RobotTerm:
     axis: int
     """Index of the axis whose angle it changes."""
     order: int
-    """Compliance: the link frame at which the mass sits (n is the flange). Transmission: cycles per turn."""
+    """Compliance: the link frame at which the mass sits (n is the flange). Transmission: cycles per turn. Linkage: unused."""
+    estimated: bool = False
+    """Whether the term is an unknown of the solve; else it stays zero and is only considered in the covariance."""
 
     @property
     def name(self) -> str:
         """For files and tables; axes and links counted from 1."""
-        what = f"mass_at_link{self.order}" if self.kind == "compliance" else f"{self.order}_per_turn"
+        what = {"compliance": f"mass_at_link{self.order}", "tangent": "cranks", "secant": "rods"}.get(self.kind, f"{self.order}_per_turn")
         return f"{self.kind}.axis{self.axis + 1}.{what}"
 
 
@@ -56,6 +67,18 @@ def arm_terms(model: RobotModel) -> tuple[RobotTerm, ...]:
     return tuple(payload + forearm + transmission)
 
 
+def candidate_groups(model: RobotModel) -> dict[str, tuple[RobotTerm, ...]]:
+    """Terms that held-out shots may ask for, by the name of what they stand for; each group wins or loses as a whole."""
+    groups = {"compliance": tuple(replace(term, estimated=True) for term in arm_terms(model) if term.kind == "compliance")}
+    coupled = (model.coupling != np.diag(np.diagonal(model.coupling))).any(axis=1)
+    for axis in np.flatnonzero(coupled).tolist():
+        groups[f"linkage of axis {axis + 1}"] = (RobotTerm("tangent", axis, 1, True), RobotTerm("secant", axis, 1, True))
+    for axis in range(model.n_joints):
+        for order in range(1, HIGHEST_ORDER + 1):
+            groups[f"axis {axis + 1}, {order} a turn"] = (RobotTerm("sine", axis, order, True), RobotTerm("cosine", axis, order, True))
+    return groups
+
+
 def load_basis(terms: tuple[RobotTerm, ...], model: RobotModel, joints_rad: ArrayLike) -> FloatArray:
     """(m, n, K) change of every link angle per unit coefficient, for q (m, n), on the nominal geometry."""
     q = np.asarray(joints_rad, dtype=np.float64)
@@ -64,11 +87,22 @@ def load_basis(terms: tuple[RobotTerm, ...], model: RobotModel, joints_rad: Arra
         return result
     frames = mdh.chain(model, q)[..., 1:, :, :]
     for k, term in enumerate(terms):
-        if term.kind == "compliance":
-            result[..., term.axis, k] = _relative_torque(term, model, frames)
-        else:
-            result[..., term.axis, k] = (np.sin if term.kind == "sine" else np.cos)(term.order * q[..., term.axis])
+        # a transmission turns what its motor drives: on coupled axes more than one link angle
+        driven = model.coupling[:, term.axis] if term.kind in {"sine", "cosine"} else np.eye(model.n_joints)[term.axis]
+        result[..., k] = _shape(term, model, q, frames)[..., None] * driven
     return result
+
+
+def _shape(term: RobotTerm, model: RobotModel, q: FloatArray, frames: FloatArray) -> FloatArray:
+    match term.kind:
+        case "compliance":
+            return _relative_torque(term, model, frames)
+        case "sine":
+            return np.asarray(np.sin(term.order * q[..., term.axis]))
+        case "cosine":
+            return np.asarray(np.cos(term.order * q[..., term.axis]))
+    away = np.clip((q @ model.coupling.T)[..., term.axis], -_STRETCHED_RAD, _STRETCHED_RAD)
+    return np.asarray(np.tan(away) if term.kind == "tangent" else 1.0 / np.cos(away))
 
 
 def deflection_rad(terms: tuple[RobotTerm, ...], coefficients_rad: FloatArray, model: RobotModel, joints_rad: ArrayLike) -> FloatArray | None:

@@ -25,15 +25,18 @@ from calibrate.model_choice import choose_model, is_open
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.plausibility import check_reported_poses
+from calibrate.plausibility_arcs import check_arcs
 from calibrate.plausibility_closure import check_closure, with_hints
 from calibrate.plausibility_scans import check_units
 from calibrate.problem import Priors, Problem, State
+from calibrate.rejection import unexplained
 from calibrate.report_figures import make_result
 from calibrate.result import Calibration
 from calibrate.second_look import see_sessions
 from calibrate.start import start_from_centres
 from calibrate.start_arcs import start_from_arcs
-from calibrate.validation import Prediction, cross_validate, predict, shot_centre_covariance_mm2
+from calibrate.term_choice import NO_CHOICE, choose_terms, with_terms
+from calibrate.validation import Prediction, cross_validate
 from drivers.errors import DataError, SettingsError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
@@ -43,9 +46,6 @@ _LOG = logging.getLogger(__name__)
 _DEFAULT_SIGHT_CROSSING_MM = (60.0, 0.0, 500.0)
 _AUTO = ("none", "affine", "pillow", "field")
 _THIN_POINTS = 250
-_REJECT_CHI2 = 30.7
-"""A clean shot exceeds this in one of a million cases (chi-square, three degrees of freedom)."""
-_MEDIAN_CHI2 = 2.366
 _REJECT_ROUNDS = 4
 _FIRST_NOISE = NoiseModel(point_mm=0.05, pose_mm=0.3, pose_rad=5e-4)
 
@@ -58,6 +58,8 @@ class CalibrationSettings:
     """auto, none, affine, pillow, pillow-free, pillow-full, pillow-full-free or field."""
     method: str = "clouds"
     """clouds, centres for one fitted centre a shot, or stepwise for the paper's solver."""
+    robot_terms: str = "auto"
+    """Terms of the arm beyond link twists: auto estimates those that held-out shots want, none leaves them all considered."""
     priors: Priors = field(default_factory=Priors)
 
 
@@ -208,13 +210,20 @@ def solve_observations(
     else:
         spoiled = tuple(_not_taken(shot, settings.method) for shot in observations.external)
     first, rejected = replace(first, problem=problem), rejected + spoiled
-    if not is_open(models, problem):
-        return _solve_and_reject(solver, first, start, keep, rejected), {}
-    keep, about, rejected = _solved_on_some_points(solver, first, start, keep, rejected)
-    choice = choose_model(about, models)
-    _LOG.debug("held-out rms by camera error model: %s", choice.held_out_rms_mm)
-    everything = first.subset(np.arange(first.problem.n_shots), choice.model)
-    return _solve_and_reject(solver, everything, choice.state, keep, rejected), choice.held_out_rms_mm
+    compared: dict[str, float] = {}
+    if is_open(models, problem):
+        keep, about, rejected = _solved_on_some_points(solver, first, start, keep, rejected)
+        choice = choose_model(about, models)
+        first, start, compared = first.subset(np.arange(first.problem.n_shots), choice.model), choice.state, dict(choice.held_out_rms_mm)
+    solved = _solve_and_reject(solver, first, start, keep, rejected)
+    arm = choose_terms(solved.solution) if settings.method == "clouds" and settings.robot_terms == "auto" else NO_CHOICE
+    _LOG.debug("held-out rms by camera error model: %s, by terms of the arm: %s", compared, arm.held_out_rms_mm)
+    if not arm.names:
+        return solved, compared
+    # what the terms explain may have looked like outliers: every shot gets another chance
+    first = replace(first, problem=with_terms(first.problem, arm.terms))
+    start = replace(solved.solution.state, terms_rad=np.zeros(len(arm.terms)))
+    return _solve_and_reject(solver, first, start, keep, rejected), {**compared, **arm.held_out_rms_mm}
 
 
 def _candidates(observations: Observations, cell: Cell, settings: CalibrationSettings) -> list[CameraError]:
@@ -230,7 +239,9 @@ def _start(assembled: Assembled, cell: Cell) -> tuple[State, NDArray[np.int64], 
     """First guess, the shots that fit it, and those that do not."""
     problem, shots = assembled.problem, assembled.shots
     if not problem.along_sight:
-        return start_from_arcs(problem, cell.flange_from_camera).state, np.arange(len(shots)), ()
+        found = start_from_arcs(problem, cell.flange_from_camera)
+        check_arcs(problem, shots, found.scale_mm)
+        return found.state, np.arange(len(shots)), ()
     centres = np.array([shot.centre_in_camera_mm for shot in shots], dtype=np.float64)
     start = start_from_centres(problem, centres, cell.flange_from_camera)
     rejected = tuple(_too_far(shots[i], start.miss_mm[i]) for i in np.flatnonzero(start.spoiled))
@@ -242,7 +253,7 @@ def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep
     for _ in range(_REJECT_ROUNDS):
         part = everything.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = _unexplained(part, solution)
+        far, miss_mm = unexplained(part.problem, solution)
         external, spoiled = without_spoiled(solution)
         if not far.any() and not spoiled:
             break
@@ -260,24 +271,12 @@ def _solved_on_some_points(
     for _ in range(_REJECT_ROUNDS):
         part = thin.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = _unexplained(part, solution)
+        far, miss_mm = unexplained(part.problem, solution)
         if not far.any():
             break
         rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))
         keep, start = keep[~far], solution.state
     return keep, solution, rejected
-
-
-def _unexplained(assembled: Assembled, solution: Solution) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """(m,) shots further off than noise, pose noise and the typical shot explain, and by how much (mm)."""
-    problem = assembled.problem
-    if not problem.along_sight:
-        return np.zeros(problem.n_shots, dtype=bool), np.zeros(problem.n_shots)
-    miss = predict(problem, solution.state).centre_error_mm
-    covariance, _ = shot_centre_covariance_mm2(problem, solution)
-    chi2 = np.einsum("mi,mi->m", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
-    typical = max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
-    return np.asarray(chi2 > _REJECT_CHI2 * typical), np.linalg.norm(miss, axis=1)
 
 
 def _not_taken(shot: ExternalShot, method: str) -> RejectedShot:

@@ -24,7 +24,17 @@ class CameraErrorChoice(StrEnum):
     none = "none"
     affine = "affine"
     pillow = "pillow"
+    pillow_free = "pillow-free"
+    pillow_full = "pillow-full"
+    pillow_full_free = "pillow-full-free"
     field = "field"
+
+
+class ArmTerms(StrEnum):
+    """Whether compliance, transmission and linkage errors of the arm may be estimated."""
+
+    auto = "auto"
+    none = "none"
 
 
 class Method(StrEnum):
@@ -92,6 +102,9 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write.")] = Path("calibration.yaml"),
     method: Annotated[Method, typer.Option(help="The solver.")] = Method.clouds,
     camera_error: Annotated[CameraErrorChoice, typer.Option("--camera-error", help="Model of the camera's error.")] = CameraErrorChoice.auto,
+    robot_terms: Annotated[
+        ArmTerms, typer.Option("--robot-terms", help="Terms of the arm beyond link twists: those that held-out shots want, or none.")
+    ] = ArmTerms.auto,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -106,7 +119,8 @@ def calibrate(
         require_writable(out)
         read = [read_session(folder) for folder in sessions]
         with run.console.progress("calibrating"):
-            calibration = calibrate_sessions(read, CalibrationSettings(camera_error=camera_error.value, method=method.value))
+            settings = CalibrationSettings(camera_error=camera_error.value, method=method.value, robot_terms=robot_terms.value)
+            calibration = calibrate_sessions(read, settings)
         former = save_calibration(calibration, out)
         if former is not None:
             run.console.note(f"the earlier {out} was kept as {former}")

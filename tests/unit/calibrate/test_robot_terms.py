@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.robot_terms import arm_terms, deflection_rad, load_basis
+from calibrate.robot_terms import RobotTerm, arm_terms, candidate_groups, deflection_rad, load_basis
 from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -63,3 +63,42 @@ def test_the_deflection_is_linear_and_none_where_nothing_yields(model: RobotMode
     assert deflection_rad(terms, np.zeros(len(terms)), model, q) is None
     assert deflection_rad((), np.zeros(0), model, q) is None
     assert len({term.name for term in terms}) == len(terms)
+
+
+def test_linkage_terms_close_the_four_bars() -> None:
+    """Cranks and rods that differ: what the driven axis turns by, against the closed four-bar linkage to first order."""
+    model = abb_robot()
+    tangent, secant = RobotTerm("tangent", 2, 1), RobotTerm("secant", 2, 1)
+    q = np.zeros((9, 6))
+    q[:, 1], q[:, 2] = 0.2, 0.2 + np.linspace(-1.0, 1.0, 9)
+    load = load_basis((tangent, secant), model, q)[:, 2]
+    crank, rod = 200.0, 600.0
+    for longer_crank, longer_rod in ((0.01, 0.0), (0.0, 0.01), (0.02, -0.01)):
+        turned = [driven_angle(crank + longer_crank, rod + longer_rod, rod, crank, angle) - angle for angle in np.pi / 2 + q[:, 2] - q[:, 1]]
+        expected = load @ [longer_crank, -longer_rod] / crank
+        np.testing.assert_allclose(turned, expected, rtol=5e-4, atol=2e-9)
+
+
+def driven_angle(crank: float, rod: float, base: float, other_crank: float, angle: float) -> float:
+    """Angle of the driven crank of a four-bar linkage, near that of the driving one."""
+    tip = crank * np.exp(1j * angle) - base
+    distance, direction = abs(tip), np.angle(tip)
+    inner = np.arccos((distance**2 + other_crank**2 - rod**2) / (2 * distance * other_crank))
+    found = np.array([direction + inner, direction - inner])
+    away = np.angle(np.exp(1j * (found - angle)))
+    return float(angle + away[np.abs(away).argmin()])
+
+
+@robots
+def test_linkages_are_looked_for_on_coupled_axes_only(model: RobotModel) -> None:
+    named = [name for name in candidate_groups(model) if name.startswith("linkage")]
+    assert named == (["linkage of axis 3"] if model.name == "abb_irb1410" else [])
+    assert all(term.estimated for terms in candidate_groups(model).values() for term in terms)
+
+
+def test_a_gear_turns_what_its_motor_drives() -> None:
+    """On the parallelogram the second motor moves two link angles."""
+    model, q = abb_robot(), joints()
+    load = load_basis((RobotTerm("sine", 1, 3),), model, q)[:, :, 0]
+    np.testing.assert_allclose(load, np.sin(3 * q[:, 1:2]) * model.coupling[:, 1])
+    assert (np.abs(load).max(axis=0) > 0).sum() == 2
