@@ -1,0 +1,38 @@
+"""Whole sessions of a crowded scene, from frames to rejected shots: one small cell; the counts are in tests/qualify."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.crowded import SPOILS, CrowdedResult, CrowdedSession, solve_crowded, write_crowded_session
+
+SEED = 4
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> CrowdedSession:
+    return write_crowded_session(tmp_path_factory.mktemp("crowded") / "s", SEED, n_shots=54, resolution_px=(240, 150))
+
+
+@pytest.fixture(scope="module")
+def result(session: CrowdedSession) -> CrowdedResult:
+    return solve_crowded(session, ("auto", "pillow"), SEED, n_tests=30)
+
+
+def test_every_spoiled_shot_is_rejected_with_a_reason_and_hardly_another(session: CrowdedSession, result: CrowdedResult) -> None:
+    assert set(session.spoiled.values()) == set(SPOILS)
+    assert result.missed == ()
+    assert result.lost <= 2
+    assert all("mm" in reason for reason in result.reasons.values())
+
+
+def test_used_and_rejected_shots_are_all_there_are(result: CrowdedResult) -> None:
+    assert len(result.solved["auto"].assembled.shots) + len(result.reasons) == 54
+
+
+def test_a_field_follows_a_camera_that_is_no_pillow(result: CrowdedResult) -> None:
+    assert result.solved["auto"].assembled.problem.camera_error.name == "field"
+    # 0.6 is the median with 90 shots; 50 leave more open
+    assert result.rms_mm["auto"] < 0.9 * result.rms_mm["pillow"]
+    assert np.isfinite(result.solved["auto"].held_out.centre_error_mm).all()
