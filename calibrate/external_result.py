@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -64,6 +64,8 @@ class ExternalResult:
     predicted_rms_mm: float
     """First-order prediction of it."""
     shots: tuple[ExternalShotResult, ...]
+    compared: Mapping[str, float] = field(default_factory=dict)
+    """Held-out rms (mm) of external points alone with a rigid arm and with one that yields under gravity."""
 
     def to_json_dict(self) -> dict[str, object]:
         """What `spherecal calibrate --json` prints of it."""
@@ -73,11 +75,18 @@ class ExternalResult:
             "targets": {name: target.point_in_flange_mm.tolist() for name, target in self.targets.items()},
             "train_rms_mm": self.train_rms_mm,
             "cross_validated_rms_mm": self.cross_validated_rms_mm,
+            "compared": dict(self.compared),
         }
 
 
 def external_result(
-    problem: Problem, state: State, datum: Datum, covariance: FloatArray, held_out_mm: FloatArray, predicted: float
+    problem: Problem,
+    state: State,
+    datum: Datum,
+    covariance: FloatArray,
+    held_out_mm: FloatArray,
+    predicted: float,
+    compared: Mapping[str, float] | None = None,
 ) -> ExternalResult | None:
     """Frames, targets and residuals of a solve in the stated base; None where no external point took part.
 
@@ -88,6 +97,7 @@ def external_result(
         covariance: (P, P), scaled on held-out shots.
         held_out_mm: (E, 3) of `held_out_errors`.
         predicted: of `predicted_rms_mm`.
+        compared: held-out rms of the arms that were tried.
     """
     points, layout = problem.external, problem.layout
     if points is None or not points.n_shots:
@@ -119,6 +129,7 @@ def external_result(
             )
             for i, shot in enumerate(points.shots)
         ),
+        compared=compared or {},
     )
 
 
@@ -153,6 +164,7 @@ def external_data(external: ExternalResult) -> dict[str, object]:
         "train_rms_mm": external.train_rms_mm,
         "cross_validated_rms_mm": external.cross_validated_rms_mm,
         "predicted_rms_mm": external.predicted_rms_mm,
+        "compared": dict(external.compared),
         "shots": [{name: getattr(shot, name) for name in shot.__slots__} for shot in external.shots],
     }
 
@@ -172,6 +184,7 @@ def external_from_data(data: Mapping[str, object]) -> ExternalResult:
         cross_validated_rms_mm=_number(data["cross_validated_rms_mm"]),
         predicted_rms_mm=float(_array(data["predicted_rms_mm"])),
         shots=tuple(_shot(shot) for shot in _list(data["shots"])),
+        compared={name: float(_array(value)) for name, value in _mapping(data["compared"]).items()},
     )
 
 
@@ -189,10 +202,14 @@ def _shot(data: object) -> ExternalShotResult:
     )
 
 
-def _named(value: object) -> list[tuple[str, Mapping[str, object]]]:
+def _mapping(value: object) -> Mapping[str, object]:
     if not isinstance(value, dict):
         raise TypeError("keys are needed")
-    return list(value.items())
+    return value
+
+
+def _named(value: object) -> list[tuple[str, Mapping[str, object]]]:
+    return [(name, _mapping(item)) for name, item in _mapping(value).items()]
 
 
 def _list(value: object) -> list[object]:

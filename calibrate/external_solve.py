@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from calibrate.external_points import ExternalPoints, ExternalShot, external_poi
 from calibrate.external_start import ExternalStart, refine_all, start_frames
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
-from calibrate.problem import Priors, Problem, State
+from calibrate.problem import Layout, Priors, Problem, State
 from calibrate.robot_terms import arm_terms
 from calibrate.start import initial_state
 from drivers.errors import DataError
@@ -45,10 +45,12 @@ class ExternalSolved:
     held_out_mm: FloatArray
     """(E, 3) error of every point against a solve without it, base axes; NaN where no other shot shows its frame or target."""
     rejected: tuple[RejectedShot, ...]
+    compared: Mapping[str, float] = field(default_factory=dict)
+    """Held-out rms (mm) with a rigid arm and with one that yields under gravity; empty where nothing was compared."""
 
 
 def solve_robot_alone(shots: Sequence[ExternalShot], model: RobotModel, priors: Priors, flange_from_camera: FloatArray | None) -> ExternalSolved:
-    """Calibrate a robot on external points alone.
+    """Calibrate a robot on external points alone; its deflection under gravity is estimated where left-out points want it.
 
     Args:
         shots: at least one.
@@ -64,21 +66,53 @@ def solve_robot_alone(shots: Sequence[ExternalShot], model: RobotModel, priors: 
     points = external_points(shots, model, terms)
     problem = robot_problem(points, model, priors, hand_eye)
     start, points, rejected = believed(problem, points, initial_state(problem, hand_eye, np.zeros((0, 3))))
-    state = start.state
+    return _rigid_or_yielding(replace(problem, external=points), start.state, rejected)
+
+
+def _rigid_or_yielding(problem: Problem, state: State, rejected: tuple[RejectedShot, ...]) -> ExternalSolved:
+    rigid = _solve_and_reject(problem, state, rejected)
+    if not problem.terms or problem.external is None or not has_spare_points(problem.external, problem.layout):
+        return rigid
+    free = tuple(replace(term, estimated=term.kind == "compliance") for term in problem.terms)
+    yielding = _solve_and_reject(replace(problem, terms=free), rigid.solution.state, rejected)
+    compared = {"rigid": rms_mm(rigid.held_out_mm), "yielding": rms_mm(yielding.held_out_mm)}
+    return replace(yielding if _wins(yielding, rigid) else rigid, compared=compared)
+
+
+def _solve_and_reject(problem: Problem, state: State, rejected: tuple[RejectedShot, ...]) -> ExternalSolved:
+    """Solve, reject the points that the noise cannot explain, and solve again until none is left."""
     for last in (*[False] * _REJECT_ROUNDS, True):
-        problem = replace(problem, external=points)
         solution = solve_clouds(problem, without_pose_noise(state, problem.n_scans), FIRST_NOISE)
         better, spoiled = without_spoiled(solution)
         if last or better is None or not spoiled:
             break
-        points, state, rejected = better, solution.state, rejected + spoiled
+        problem, state, rejected = replace(problem, external=better), solution.state, rejected + spoiled
     return ExternalSolved(solution, held_out_errors(solution), rejected)
+
+
+def _wins(yielding: ExternalSolved, rigid: ExternalSolved) -> bool:
+    """Whether left-out points want the arm to yield: better by more than one standard error of the difference."""
+    squares = []
+    for solved in (rigid, yielding):
+        points = solved.solution.problem.external
+        shots = () if points is None else points.shots
+        squares.append({shot.key: float(error @ error) for shot, error in zip(shots, solved.held_out_mm, strict=True) if np.isfinite(error).all()})
+    gain = np.array([squares[0][key] - squares[1][key] for key in sorted(squares[0].keys() & squares[1].keys())])
+    return len(gain) > 1 and bool(gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def has_spare_points(points: ExternalPoints, layout: Layout) -> bool:
+    """Whether there are figures enough for some to be left out."""
+    unknowns = 4 * layout.n_links - 6 + 6 * layout.n_references + 3 * layout.n_targets
+    return 3 * points.n_shots >= unknowns + SPARE_ROWS
 
 
 def joined_by_external(
     problem: Problem, state: State, shots: Sequence[ExternalShot], flange_from_camera: FloatArray
 ) -> tuple[Problem, State, tuple[RejectedShot, ...]]:
     """A problem of spheres with external points added, its state with their frames and targets, and the points that fit neither.
+
+    The arm yields in it where the external points alone want it to: they see the arm without the camera's errors.
 
     Raises DataError where no frame brings the points to the arm.
     """
@@ -90,8 +124,10 @@ def joined_by_external(
         return problem, state, tuple(RejectedShot(shot.session, shot.index, why) for shot in shots)
     points = external_points(shots, model, problem.terms)
     alone = robot_problem(points, model, problem.priors, flange_from_camera)
-    _, points, rejected = believed(alone, points, initial_state(alone, flange_from_camera, np.zeros((0, 3))))
-    alone = replace(alone, external=points)
+    first, points, rejected = believed(alone, points, initial_state(alone, flange_from_camera, np.zeros((0, 3))))
+    solved = _rigid_or_yielding(replace(alone, external=points), first.state, rejected)
+    points, rejected = solved.solution.problem.external or points, solved.rejected
+    problem, alone = replace(problem, terms=solved.solution.problem.terms), replace(alone, external=points)
     bare = replace(initial_state(alone, flange_from_camera, np.zeros((0, 3))), link_twists=state.link_twists)
     start = start_frames(alone, bare).state
     problem = replace(problem, external=points.held_at(start.base_from_reference, start.target_in_flange_mm))
@@ -106,9 +142,8 @@ def believed(problem: Problem, points: ExternalPoints, state: State) -> tuple[Ex
     """
     start = start_frames(problem, state)
     points = points.held_at(start.state.base_from_reference, start.state.target_in_flange_mm)
-    problem, layout = replace(problem, external=points), problem.layout
-    unknowns = 4 * layout.n_links - 6 + 6 * layout.n_references + 3 * layout.n_targets
-    if 3 * points.n_shots < unknowns + SPARE_ROWS:  # every point fits itself: none can be told to be wrong
+    problem = replace(problem, external=points)
+    if not has_spare_points(points, problem.layout):  # every point fits itself: none can be told to be wrong
         return start, points, ()
     start = refine_all(problem, start)
     far = start.miss_mm > _GROSS_SCALES * start.scale_mm

@@ -128,7 +128,7 @@ def robot_alone_result(
         created_utc=created_utc,
         software=software,
         hand_eye="none" if cell.flange_from_camera is None else "cell",
-        external=external_result(problem, state, datum, covariance, solved.held_out_mm, predicted),
+        external=external_result(problem, state, datum, covariance, solved.held_out_mm, predicted, solved.compared),
     )
     return replace(result, id=str(calibration_data(result)["id"]))
 

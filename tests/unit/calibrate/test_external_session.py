@@ -178,13 +178,20 @@ def mixed_cell() -> tuple[TrackedRobot, dict[str, list[SyntheticShot]]]:
 def together(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Calibration, float]]:
     """The same robot by spheres, by a tracker, and by both, with the error of its unseen poses."""
     robot, spheres = mixed_cell()
-    shots = robot.shots(np.random.default_rng(53), 24)
+    rng = np.random.default_rng(53)
+    shots = robot.shots(rng, 24)
     folder = tmp_path_factory.mktemp("mixed")
     cell = paper_cell(coupled=True)
     found = {
         "spheres": write_session(folder / "spheres", cell, spheres, flange_from_camera=None, extra_cell={"limits": LIMITS}),
         "tracker": write_tracker_session(folder / "tracker", shots, tracker_cell_data("abb_irb1410")),
         "both": add_tracker_lines(write_session(folder / "both", cell, spheres, flange_from_camera=None, extra_cell={"limits": LIMITS}), shots),
+        "shuffled": add_tracker_lines(
+            write_session(
+                folder / "shuffled", cell, spheres, flange_from_camera=None, extra_cell={"limits": LIMITS}, order=rng.permutation(28).tolist()
+            ),
+            [shots[i] for i in rng.permutation(24)],
+        ),
     }
     settings = CalibrationSettings(camera_error="pillow")
     calibrations = {name: calibrate([read_session(path)], settings) for name, path in found.items()}
@@ -196,6 +203,14 @@ def test_both_together_are_better_than_either(together: dict[str, tuple[Calibrat
     assert both < 0.5 * spheres
     assert both < 1.02 * tracker
     assert both < 0.05
+
+
+def test_the_order_of_both_kinds_of_shot_changes_nothing(together: dict[str, tuple[Calibration, float]]) -> None:
+    first, second = together["both"][0], together["shuffled"][0]
+    q = np.random.default_rng(55).uniform(-0.8, 0.8, (30, 6))
+    assert np.abs(first.base_from_flange(q)[:, :3, 3] - second.base_from_flange(q)[:, :3, 3]).max() < 1e-6
+    for name in "AB":
+        np.testing.assert_allclose(first.sphere_centres_in_base_mm[name], second.sphere_centres_in_base_mm[name], atol=1e-6)
 
 
 def test_spheres_keep_what_a_tracker_cannot_tell(together: dict[str, tuple[Calibration, float]]) -> None:
