@@ -65,11 +65,16 @@ class Cause:
 
 def causes(data: Recorded) -> tuple[Cause, ...]:
     """Every cause that may be tried on such data, the plain ones first."""
+    found = (*plain_causes(data), *_scan_causes())
     if data.model is None or data.joints_rad is None:
-        return (*_pose_causes(), *_scan_causes())
-    n = data.model.n_joints
+        return found
     # several turned axes come last: they can stand for a mirror, and a wrist has two ways to reach every pose
-    return (*_joint_causes(data.model), *_scan_causes(), *_sign_causes(n, 2, n))
+    return (*found, *_sign_causes(data.model.n_joints, 2, data.model.n_joints))
+
+
+def plain_causes(data: Recorded) -> tuple[Cause, ...]:
+    """Those that change poses or axis angles only, one thing at a time."""
+    return tuple(_pose_causes() if data.model is None or data.joints_rad is None else _joint_causes(data.model))
 
 
 def shifts() -> tuple[Cause, ...]:

@@ -17,8 +17,10 @@ from drivers.errors import DataError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
 
+TRIED_FROM_MM = 1.0
+"""Sigma of one component that good robots stay below; beyond it mistakes are tried, at no risk for a bad robot."""
 CLOSES_MM = 3.0
-"""A nominal robot leaves less than this, in sigma of one component; beyond it mistakes are tried, at no risk for a bad robot."""
+"""What bad robots may leave; beyond it the shots do not belong together."""
 _EXPLAINS = 5.0
 _PLAUSIBLE_MM = 15.0
 _HOPELESS_MM = 30.0
@@ -51,17 +53,17 @@ def check_closure(sessions: Sequence[Session], observations: Observations, model
     file = sessions[0].folder / "shots.jsonl" if sessions else None
     closure = close(data)
     spread_mm = float(closure.spread_mm[0])
+    enough_mm = min(spread_mm / _EXPLAINS, _PLAUSIBLE_MM)
+    tried = try_causes(data) if spread_mm > TRIED_FROM_MM else []
+    best_mm = min((trial.spread_mm for trial in tried), default=np.inf)
+    if best_mm <= enough_mm:
+        equal = [trial for trial in tried if trial.spread_mm <= _AS_GOOD * best_mm]
+        raise DataError(_explained(spread_mm, equal), file=file, remedy=equal[0].cause.remedy)
     if spread_mm <= CLOSES_MM:
         pairs = pairs_of(data, closure)
         _refuse_slipped(pairs, file)
         names = sorted({shot.sphere for shot in useful})
         return {useful[row].key: text for row, text in pairs.told(names).items()}
-    enough_mm = min(spread_mm / _EXPLAINS, _PLAUSIBLE_MM)
-    tried = try_causes(data)
-    best_mm = min(trial.spread_mm for trial in tried)
-    if best_mm <= enough_mm:
-        equal = [trial for trial in tried if trial.spread_mm <= _AS_GOOD * best_mm]
-        raise DataError(_explained(spread_mm, equal), file=file, remedy=equal[0].cause.remedy)
     slipped = slipped_pairs(data)
     if slipped is not None and slipped.spread_mm <= enough_mm:
         _refuse_slipped(slipped, file)

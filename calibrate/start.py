@@ -18,6 +18,7 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _ROUNDS = 30
+_STILL_MM = 1e-7
 _SMALLEST_SCALE_MM = 0.05
 _REJECT_SCALES = 8.0
 _REJECT_AT_LEAST_MM = 1.0
@@ -114,13 +115,17 @@ def _linear_hand_eye(problem: Problem, centres: FloatArray) -> FloatArray | None
 def _refine(problem: Problem, centres: FloatArray, hand_eye: FloatArray) -> Start:
     """Gauss-Newton on centres, a weight per shot; first the hand-eye transform and centres, then everything."""
     state = initial_state(problem, hand_eye, centres_by_median(problem, hand_eye, centres))
-    weight, scale, miss = np.ones(problem.n_shots), np.inf, np.zeros(problem.n_shots)
+    scale, miss, everything = np.inf, np.full(problem.n_shots, np.inf), False
     for turn in range(_ROUNDS):
         geometry = linearise_geometry(problem, state)
         camera_shift = _basis_at(problem, centres)
         corrected = centres + np.einsum("mki,k->mi", camera_shift, state.camera_mm)
         difference = corrected - geometry.centre_in_camera_mm
-        miss = np.linalg.norm(difference, axis=1)
+        previous, miss = miss, np.linalg.norm(difference, axis=1)
+        still = bool(np.abs(miss - previous).max() < _STILL_MM)
+        if everything and still:
+            break
+        everything = everything or still or turn >= _ROUNDS // 3
         # the median length of a 3-vector of unit noise is 1.54
         scale = max(float(np.median(miss)) / 1.54, _SMALLEST_SCALE_MM)
         weight = _weights(miss, scale)
@@ -128,7 +133,7 @@ def _refine(problem: Problem, centres: FloatArray, hand_eye: FloatArray) -> Star
         linearised = normal.linearise(problem, state, geometry, moments, np.full(problem.n_shots, scale**-2.0))
         held = NoiseModel(scale, 1e-6, 1e-9)
         reduced = normal.reduce(linearised, held.pose_precision)
-        if turn < _ROUNDS // 3:
+        if not everything:
             free = np.zeros(problem.layout.size, dtype=bool)
             free[problem.layout.hand_eye] = free[problem.layout.centres] = True
             step = np.zeros(problem.layout.size)

@@ -54,7 +54,7 @@ class _Fits:
         return _Fits(self.flange_from_camera[rows], self.centres_in_base_mm[rows], self.rms_mm[rows])
 
 
-def start_from_arcs(problem: Problem, guess: FloatArray | None, seed: int = 7447) -> Start:
+def start_from_arcs(problem: Problem, guess: FloatArray | None, seed: int = 7447, *, n_starts: int = _N_STARTS) -> Start:
     """The best of many local solves for hand-eye and centres, every other error at zero; of one where the guess is good.
 
     Raises:
@@ -69,7 +69,7 @@ def start_from_arcs(problem: Problem, guess: FloatArray | None, seed: int = 7447
         guessed = _refined(arcs, _start(problem, mean, guess[None, :3, :3]), _FINAL_ROUNDS)
         if problem.n_shots >= _ENOUGH_ARCS and _is_good(guessed, guess):
             return _as_start(problem, guessed)
-    quaternions = np.random.default_rng(seed).normal(size=(_N_STARTS, 4))
+    quaternions = np.random.default_rng(seed).normal(size=(n_starts, 4))
     fits = _refined(arcs, _start(problem, mean, _rotation_of_quaternion(quaternions)), _ROUNDS)
     fits = _refined(arcs, fits.part(np.argsort(fits.rms_mm, kind="stable")[:_FINALISTS]), _FINAL_ROUNDS)
     fits = fits.part(np.argsort(fits.rms_mm, kind="stable")[:1])
