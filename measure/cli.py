@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from measure.cli_abb import abb_program
 from measure.cli_capture import capture
 from measure.cli_cell import doctor, new_cell
 from measure.cli_controller import simulate_controller
@@ -22,6 +23,7 @@ from measure.cli_plan import plan
 from measure.cli_predict import predict
 from measure.cli_report import report, show
 from measure.cli_run import run_app
+from measure.cli_serve import serve_cell
 from measure.cli_solve import calibrate, centres
 from measure.cli_study import study
 from measure.console import Console
@@ -52,6 +54,8 @@ app.command("show")(show)
 app.command("study")(study)
 app.command("export")(export)
 app.command("simulate-controller")(simulate_controller)
+app.command("abb-program")(abb_program)
+app.command("serve-cell")(serve_cell)
 
 
 @app.callback(invoke_without_command=True)

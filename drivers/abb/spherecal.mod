@@ -128,14 +128,12 @@ MODULE Spherecal
 
     ! The only place where the robot is moved. sphGo is spent before the motion begins.
     PROC SphMoveNow()
+        sphMoving:=TRUE;
         sphGo:=FALSE;
-        IF ClkRead(sphClock)-sphGivenAt>SPH_TOKEN_LIFE THEN
-            sphOutcome:=SPH_HELD;
-            RETURN;
-        ENDIF
+        IF ClkRead(sphClock)-sphGivenAt>SPH_TOKEN_LIFE SphGiveUp SPH_HELD;
         sphSeenAt:=ClkRead(sphClock);
         SphArm;
-        sphMoving:=TRUE;
+        IF sphHeldNow SphGiveUp SPH_HELD;
         MoveAbsJ sphTarget\NoEOffs,v1000\T:=sphTime,fine,sphTool;
         sphMoving:=FALSE;
         sphOutcome:=SPH_REACHED;
@@ -185,9 +183,12 @@ MODULE Spherecal
         ExitCycle;
     ENDPROC
 
-    ! Event routine for the event RESTART (Start pressed while a motion was held): nothing moves until
-    ! SphPoll has given the old motion up.
+    ! Event routine for the event RESTART (Start pressed while the program was held): what was asked for and
+    ! not begun is forgotten, and nothing moves until SphPoll has given up what was begun.
     PROC SphOnRestart()
+        sphTokenNo:=0;
+        IF sphGo sphOutcome:=SPH_HELD;
+        sphGo:=FALSE;
         IF sphMoving THEN
             sphHeldNow:=TRUE;
             StopMove\Quick;

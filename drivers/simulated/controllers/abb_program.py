@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drivers.abb.answers import Answerer, Declined
 from drivers.abb.protocol import (
-    ANSWERS,
-    ARGUMENTS,
     FASTEST_DEG_S,
     LAST_EPOCH,
     LENGTH_DECIMALS,
@@ -25,16 +24,12 @@ from drivers.abb.protocol import (
     QUATERNION_DECIMALS,
     TOKEN_LIFE_S,
     VERSION,
-    BadLine,
-    Code,
     Fault,
     Line,
     Outcome,
     StateReply,
     Verb,
     angle_text,
-    decode,
-    encode,
     number_text,
     numbers,
     state_arguments,
@@ -46,17 +41,7 @@ from drivers.simulated.cell import SimulatedCell
 
 RAMP_S = 0.5
 """Added to way over speed, so that the controller's own acceleration never needs more than the speed asked for."""
-_FAULT_TEXTS = {
-    Fault.SYNTAX: "syntax",
-    Fault.VERB: "unknown verb",
-    Fault.EPOCH: "another epoch",
-    Fault.TOKEN: "no such target",
-    Fault.EXPIRED: "target expired",
-    Fault.BUSY: "moving",
-    Fault.SPEED: "speed",
-    Fault.NUMBER: "number used for another request",
-    Fault.NOT_READY: "not ready",
-}
+_VERBS = tuple(verb for verb in Verb if verb is Verb.HELLO or verb not in MASTER_VERBS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +49,6 @@ class _Target:
     token: int
     joints_deg: FloatArray
     given_s: float
-
-
-class _No(Exception):
-    """A request that is answered by an error."""
-
-    def __init__(self, fault: Fault) -> None:
-        super().__init__()
-        self.fault = fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +83,7 @@ class AbbProgram:
         self.stop_letter, self.motors, self.mode = "N", "1", "A"
         self._outcome, self._last_token = Outcome.NONE, 0
         self._target: _Target | None = None
-        self._cached: tuple[bytes, bytes] | None = None
+        self._answers = Answerer(self._do, _VERBS)
         self._heard_s, self._watchdog_s = now(), 3.0
         self._path_rad: FloatArray | None = None
 
@@ -118,33 +95,12 @@ class AbbProgram:
     def answer(self, data: bytes) -> bytes:
         """The reply to a line; a repeated request gets the same words and does nothing (PROC SphAnswer)."""
         self.tick()
-        try:
-            line = decode(data)
-        except BadLine:
-            return encode(0, Code.ERROR, str(int(Fault.CHECKSUM)), "checksum")
-        self._heard_s = self._now()
-        if line.word == Verb.HELLO:
-            self._cached = None  # a new conversation begins
-        if self._cached is not None and self._cached[0] == data:
-            return self._cached[1]
-        try:
-            if self._cached is not None and self._cached[0][:4] == data[:4]:
-                raise _No(Fault.NUMBER)
-            reply = encode(line.number, ANSWERS[Verb(line.word)], *self._do(line))
-        except _No as no:
-            reply = encode(line.number, Code.ERROR, str(int(no.fault)), *_FAULT_TEXTS[no.fault].split())
-        except (BadLine, ValueError):
-            fault = Fault.SYNTAX if line.word in tuple(Verb) else Fault.VERB
-            reply = encode(line.number, Code.ERROR, str(int(fault)), *_FAULT_TEXTS[fault].split())
-        self._cached = (data, reply)
+        reply = self._answers.answer(data)
+        if not reply.startswith(b"0000"):
+            self._heard_s = self._now()
         return reply
 
     def _do(self, line: Line) -> tuple[str, ...]:
-        verb = Verb(line.word)
-        if verb in MASTER_VERBS and verb is not Verb.HELLO:
-            raise _No(Fault.VERB)
-        if len(line.arguments) != ARGUMENTS[verb]:
-            raise _No(Fault.SYNTAX)
         routines: dict[Verb, Callable[[Line], tuple[str, ...]]] = {
             Verb.HELLO: lambda _: (str(VERSION), str(self.epoch)),
             Verb.INFO: self._info,
@@ -156,13 +112,13 @@ class AbbProgram:
             Verb.LAST: lambda _: (str(self.epoch), str(self._last_token), str(int(self._outcome))),
             Verb.STOP: lambda _: self._stop(),
         }
-        return routines[verb](line)
+        return routines[Verb(line.word)](line)
 
     def _info(self, line: Line) -> tuple[str, ...]:
         which = whole(line.arguments[0], 3)
         text = {1: self.identity.serial, 2: self.identity.version, 3: self.identity.kind}.get(which)
         if text is None:
-            raise _No(Fault.SYNTAX)
+            raise Declined(Fault.SYNTAX)
         return (str(which), *text.split())
 
     def state(self, *, seen_from_outside: bool = False) -> StateReply:
@@ -181,7 +137,7 @@ class AbbProgram:
 
     def _take_target(self, line: Line) -> tuple[str, ...]:
         if self.moving:
-            raise _No(Fault.BUSY)
+            raise Declined(Fault.BUSY)
         joints_deg = np.array(numbers(line.arguments, N_AXES))
         self._target = _Target(line.number, joints_deg, self._now())
         return tuple(angle_text(float(angle)) for angle in joints_deg.astype(np.float32))
@@ -190,16 +146,16 @@ class AbbProgram:
         epoch, token = whole(line.arguments[0], LAST_EPOCH), whole(line.arguments[1], 9999)
         speed_deg_s, watchdog_s = numbers(line.arguments[2:], 2)
         if self.moving:
-            raise _No(Fault.BUSY)
+            raise Declined(Fault.BUSY)
         if epoch != self.epoch:
-            raise _No(Fault.EPOCH)
+            raise Declined(Fault.EPOCH)
         target, self._target = self._target, None
         if target is None or target.token != token:
-            raise _No(Fault.TOKEN)
+            raise Declined(Fault.TOKEN)
         if self._now() - target.given_s > TOKEN_LIFE_S:
-            raise _No(Fault.EXPIRED)
+            raise Declined(Fault.EXPIRED)
         if not (0 < speed_deg_s <= FASTEST_DEG_S and 0 < watchdog_s <= 30):
-            raise _No(Fault.SPEED)
+            raise Declined(Fault.SPEED)
         way_deg = float(np.abs(target.joints_deg - np.degrees(self.cell.joints_rad())).max())
         self._begin(np.radians(target.joints_deg), float(np.radians(speed_deg_s)))
         self._watchdog_s, self._last_token, self._outcome = watchdog_s, token, Outcome.RUNNING
@@ -269,7 +225,8 @@ class AbbProgram:
         self.held = False
         self.cell.stop_motion()
         self.epoch = self.epoch % LAST_EPOCH + 1
-        self._outcome, self._last_token, self._target, self._cached, self._path_rad = Outcome.NONE, 0, None, None, None
+        self._answers.forget()
+        self._outcome, self._last_token, self._target, self._path_rad = Outcome.NONE, 0, None, None
 
     def use(self, **changes: str) -> None:
         """Another identity."""

@@ -26,7 +26,10 @@ print("\\n".join(["loaded:", *sorted(sys.modules)]), file=sys.stderr)
 sys.exit(code)
 """
 
-VERBS = ["demo", "new", "doctor", "plan", "predict", "capture", "centres", "calibrate", "verify", "stitch", "report", "show", "study"]
+VERBS = [
+    *("demo", "new", "doctor", "plan", "predict", "capture", "centres", "calibrate", "verify", "stitch", "report", "show", "study"),
+    *("simulate-controller", "abb-program", "serve-cell"),
+]
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["calibrate", "--help"], ["--version"]])

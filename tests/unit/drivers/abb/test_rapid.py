@@ -13,7 +13,7 @@ from drivers.abb.protocol import ARGUMENTS, MASTER_VERBS, Fault, LineBuffer, Out
 from drivers.errors import SettingsError
 from drivers.simulated.controllers.abb_program import RAMP_S, AbbProgram
 from tests.support.abb import abb_cell
-from tests.support.rapid import KEYWORDS, LONGEST_NAME, Module, RapidSyntaxError, read
+from tests.support.rapid import KEYWORDS, LONGEST_NAME, ExitCycle, Module, RapidSyntaxError, read
 from tests.support.rapid_world import World
 
 MODULES = ("spherecal.mod", "spherecal_main.mod", "spherecal_tcp.mod", "spherecal_serial.mod", "spherecal_state.mod", "spherecal_job.mod")
@@ -274,6 +274,25 @@ def test_a_motion_that_was_held_never_goes_on() -> None:
         assert told(world, "E")[-1][0] == str(int(Fault.TOKEN))
         assert world.moves_begun == 1
         assert world.travelled_deg <= most_deg
+
+
+def test_a_motion_that_was_asked_for_and_held_before_it_began_does_not_begin() -> None:
+    """Start is pressed between GO and the motion, and between the motion's first lines and MoveAbsJ."""
+    world = script((0.1, target(30.0)))
+    world.ends_s = 0.5
+    world.run()
+    world.machine.data.update(sphGo=True, sphTokenNo=np.float32(5))
+    world.machine.call("SphOnRestart")
+    assert (world.machine.data["sphGo"], world.machine.data["sphTokenNo"]) == (False, 0)
+    assert world.machine.data["sphOutcome"] == Outcome.HELD
+    assert not world.stop_move
+    for changes in ({"sphHeldNow": True, "sphGivenAt": np.float32(0.1)}, {"sphGivenAt": np.float32(-20.0)}):
+        world.machine.data.update(sphGo=True, **changes)
+        with pytest.raises(ExitCycle):
+            world.machine.call("SphMoveNow")
+        assert world.machine.data["sphOutcome"] == Outcome.HELD
+        assert not world.machine.data["sphMoving"]
+    assert world.moves_begun == 0
 
 
 def test_after_pp_to_main_nothing_of_before_is_known() -> None:
