@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from calibrate.camera_error import FreeCrossing
 from calibrate.clouds import Solution
 from calibrate.gauge import ANGLE_SCALE_MM, OpenDirections, camera_gauge_twists, named_directions, parameter_scale
 from calibrate.normal import symmetric_inverse
@@ -122,7 +123,7 @@ def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
     return Identifiability(
         rank=rank,
         n_parameters=n,
-        expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera - camera_gauge(problem),
+        expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera - camera_gauge(problem) - _held_by_prior(problem),
         condition=float(singular[0] / singular[rank - 1]),
         gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if rank < n else float("inf"),
         singular_values=singular,
@@ -134,6 +135,11 @@ def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
 def camera_gauge(problem: Problem) -> int:
     """Number of directions in which the camera error model only repeats the hand-eye transform (lateral terms turn the view)."""
     return len(camera_gauge_twists(problem))
+
+
+def _held_by_prior(problem: Problem) -> int:
+    """Number of camera terms that shots are not asked to tell: where a pillow's lines of sight cross says little beside its size."""
+    return len(problem.camera_error.crossing_terms) if isinstance(problem.camera_error, FreeCrossing) else 0
 
 
 def parameter_names(layout: Layout, terms: tuple[RobotTerm, ...], spheres: tuple[str, ...]) -> tuple[str, ...]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibrate import Calibration
 from calibrate.camera_error import CameraError, FreeCrossing, FullPillowError, NoCameraError, PillowError, PolynomialError, correction_in_camera_mm
 from calibrate.camera_error_field import affine_error, box_of_points, default_field, richest_field
 from calibrate.camera_error_stack import StackedModels
@@ -15,11 +17,14 @@ from calibrate.clouds import Solution, solve_clouds
 from calibrate.linear_folds import Folds, full_step, held_out_miss_mm, linear_folds, noise_of
 from calibrate.model_choice import choose_model, is_open, simplest_of_the_best
 from calibrate.problem import Problem
+from calibrate.solve import CalibrationSettings, calibrate
 from calibrate.validation import cross_validate, folds_of
+from drivers.files.session import read_session
 from drivers.kinematics.se3 import FloatArray
 from tests.support.bound import FIRST_NOISE, held_out_rms_mm
 from tests.support.solving import draw_shots, noise_free, problem_of, start_of
 from tests.support.synthetic import bowl_ripple_mm, paper_cell, pillow_error_mm
+from tests.support.synthetic_session import write_session
 
 CELL = paper_cell()
 N_SHOTS, N_POINTS = 60, 120
@@ -189,3 +194,17 @@ def measured_with(problem: Problem, truth: CameraError, coefficients_mm: FloatAr
     """A problem whose points a camera measured that `truth` corrects, to first order."""
     points = problem.points_in_camera_mm
     return replace(problem, points_in_camera_mm=points - correction_in_camera_mm(truth, coefficients_mm, points))
+
+
+@pytest.mark.parametrize("name", ["pillow-free", "pillow-full", "pillow-full-free"])
+def test_a_calibration_with_a_pillow_of_any_kind_comes_back_from_its_file(name: str, tmp_path: Path) -> None:
+    shots = draw_shots(CELL, np.random.default_rng(80), 40, n_points=80)
+    session = read_session(write_session(tmp_path / "s", CELL, {"A": shots}, flange_from_camera=None))
+    found = calibrate([session], CalibrationSettings(camera_error=name))
+    assert found.camera_error.name == name
+    # a crossing that the shots say little of is no shortcoming of theirs
+    assert found.verdict == "marginal", found.reasons
+    found.save(tmp_path / "c.yaml")
+    again = Calibration.load(tmp_path / "c.yaml")
+    points, joints = shots[0].points_in_camera_mm, shots[0].joints_rad
+    np.testing.assert_array_equal(again.points_in_base_mm(points, joints_rad=joints), found.points_in_base_mm(points, joints_rad=joints))
