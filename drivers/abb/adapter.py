@@ -29,7 +29,7 @@ from drivers.abb.protocol import (
     parse_state,
     whole,
 )
-from drivers.abb.replies import check_free, pose_of, refused, robot_state, two_words
+from drivers.abb.replies import check_free, pose_of, refused, robot_state, two_words, type_notes
 from drivers.abb.second import SecondProgram
 from drivers.abb.settings import AbbSettings
 from drivers.errors import (
@@ -128,7 +128,7 @@ class AbbRobot:
         serial, version, kind = (" ".join(ask(Verb.INFO, str(i))[1:]) or None for i in (1, 2, 3))
         tool, work_object = self._read(lambda: two_words(ask(Verb.TOOL)))
         self._check_frames(tool, work_object)
-        notes = (f"active tool {tool}, work object {work_object}",)
+        notes = () if self._model is None else type_notes(kind, self._model.name)
         return RobotInfo("abb_socket", model=kind, serial=serial, controller=f"IRC5 {version}", notes=notes)
 
     def _check_frames(self, tool: str, work_object: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from drivers.abb.line import Refusal, Reply, is_fault
@@ -79,3 +81,11 @@ def two_words(arguments: tuple[str, ...]) -> tuple[str, str]:
     return first, second
 
 
+
+
+def type_notes(kind: str | None, model_name: str) -> tuple[str, ...]:
+    """What is to be said when the controller's robot type ("IRB 1410-5/1.44") has another number than the model's name."""
+    told, believed = re.search(r"IRB\W*([0-9]+)", kind or "", re.IGNORECASE), re.search(r"irb_?([0-9]+)", model_name, re.IGNORECASE)
+    if told is None or believed is None or told[1] == believed[1]:
+        return ()
+    return (f"the controller says that it is an {kind}, the cell's model is {model_name}",)

@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,14 +15,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquire.cell import load_cell
+from acquire.cell import devices_of, load_cell
 from acquire.plan import load_plan, write_plan
 from calibrate import Calibration
-from drivers.abb.protocol import angle_text
+from drivers.abb.adapter import AbbRobot
+from drivers.abb.line import LineClient
+from drivers.abb.protocol import Verb, angle_text
+from drivers.abb.settings import parse_settings
+from drivers.errors import RobotTimeout
 from drivers.files.session import read_session
 from drivers.files.yaml import dump_yaml, parse_yaml
 from drivers.kinematics.se3 import FloatArray
 from drivers.simulated.truth_file import load_truth, write_truth
+from drivers.transport import TcpLink
 from measure.cli import app
 from measure.cli_run import run_app
 from tests.system.conftest import Cli, SmallCell
@@ -180,3 +186,53 @@ def test_a_run_that_an_emergency_stop_ended_is_resumed(work: Work, cli: Cli) -> 
         result = cli("capture", cell, plan, "-o", work.folder / "held_s", "--yes", "--json")
         assert result.code == 0, result.err
         assert json.loads(result.out)["n_shots"] == N_VERIFICATION
+
+
+def test_a_program_of_the_robots_own_asks_for_pictures(work: Work) -> None:
+    """`serve-cell` in a process of its own; the test is the robot's program: it moves, triggers, and asks later."""
+    with served("--cell", work.folder / "plain.yaml", "--speed-up", 60) as at:
+        cell = work.cell("master", at, host="127.0.0.1", port=at.port)
+        plan = load_plan(plan_for(work, cell, "verification"))
+        command = [sys.executable, "-m", "measure.cli", "serve-cell", str(cell), "-o", str(work.folder / "master_s")]
+        command += ["--port", "0", "--count", "3", "--json"]
+        pipe = subprocess.PIPE
+        process = subprocess.Popen([*command, "--plan", str(plan_for(work, cell, "verification"))], stdout=pipe, stderr=pipe, text=True)
+        assert process.stderr is not None
+        match = re.search(r"at 127\.0\.0\.1:(\d+)", process.stderr.readline())
+        assert match is not None
+        robot = devices_of(load_cell(cell)).robot
+        robot.open()
+        client = LineClient(TcpLink("127.0.0.1", int(match[1])))
+        client.open(1.0)
+        for i in (1, 2, 3):
+            robot.start_move(plan.poses[i - 1].joints_rad, speed_rad_s=1.0)
+            while (state := robot.read_state()).moving:
+                robot.wait(0.02)
+            assert state.joints_rad is not None
+            client.ask(Verb.TRIGGER, str(i), *(angle_text(float(angle)) for angle in np.degrees(state.joints_rad)), timeout_s=1.0)
+            told = "EXPOSING"
+            while told in ("EXPOSING", "EXPOSED") and (i < 3 or told == "EXPOSING"):
+                told = client.ask(Verb.RESULT, str(i), timeout_s=1.0).line.arguments[1]
+                time.sleep(0.02)
+            assert told != "NG"
+        client.close()
+        robot.close()
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert json.loads(out)["n_shots"] == 3
+    shots = read_session(work.folder / "master_s").shots
+    assert [shot.pose_id for shot in shots] == [pose.id for pose in plan.poses[:3]]
+    assert all(shot.status == "ok" and shot.sphere is not None for shot in shots)
+
+
+def test_a_fault_from_the_start_and_one_that_is_not_known(tmp_path: Path, cli: Cli) -> None:
+    with served("--fault", "silence") as at:
+        robot = AbbRobot(parse_settings({"host": "127.0.0.1", "port": at.port}), None)
+        with pytest.raises(RobotTimeout):
+            robot.open()
+    result = cli("simulate-controller", "abb", "--host", "127.0.0.1", "--port", "0", "--bench-port", "0", "--fault", "nonsense", "--json")
+    assert result.code == 1
+    assert "black_hole" in result.told["error"]["message"]
+    told = cli("abb-program", "--out", tmp_path / "rapid", "--json").told
+    assert "spherecal.mod" in told["files"]
+    assert cli("abb-program", "--out", tmp_path / "rapid", "--json").code == 1

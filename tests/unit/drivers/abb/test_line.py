@@ -15,7 +15,7 @@ from drivers.abb.protocol import Code, Fault, Verb, encode
 from drivers.abb.settings import AbbSettings
 from drivers.errors import LinkLost, MotionRefused, RobotError, RobotTimeout, WrongController
 from drivers.kinematics.se3 import FloatArray
-from drivers.protocols import RobotState
+from drivers.protocols import MAX_AGE_S, RobotState
 from tests.support.abb import TARGETS_DEG, abb_model, controller, robot_over_tcp
 from tests.support.abb_virtual import VirtualCell, VirtualTime, virtual_cell
 from tests.support.source import ROOT
@@ -141,6 +141,26 @@ def test_a_target_that_comes_back_changed_is_not_started(cell: VirtualCell) -> N
     with pytest.raises(MotionRefused):
         cell.robot.start_move(np.radians(TARGETS_DEG[1]), speed_rad_s=0.5)
     assert cell.program.n_motions == 0
+
+
+def test_two_hundred_moves_in_a_row_lose_nothing(cell: VirtualCell) -> None:
+    """Every seventh reply is lost on the way."""
+    cell.robot.open()
+    count, rng = [0], np.random.default_rng(7)
+
+    def lose_some(reply: bytes) -> bytes | None:
+        count[0] += 1
+        return None if count[0] % 7 == 0 else reply
+
+    cell.link.spoil = lose_some
+    for i in range(200):
+        target_rad = np.radians(rng.uniform(-60, 60, 6) * [1, 0.5, 0.5, 1, 1, 2])
+        cell.robot.start_move(target_rad, speed_rad_s=1.0)
+        assert cell.program.n_motions == i + 1
+        while (state := cell.robot.read_state()).moving:
+            assert state.age_s <= MAX_AGE_S
+            cell.robot.wait(0.2)
+        np.testing.assert_allclose(joints_of(state), target_rad, atol=1e-6)
 
 
 class Noise:
