@@ -1,6 +1,7 @@
 """The base frame of a calibration: a free solve moves it by tenths of a mm, so it must be said (DESIGN.md 3, *Datum*).
 
-The base is the rigid motion that brings the calibrated robot nearest to the nominal one over the poses that were used:
+The base is the rigid motion that brings the calibrated robot nearest to the nominal one over the work volume, or over the
+poses that were used where the cell states none (see `datum_poses`):
 four points fixed to the flange (its origin and three at the distance of the work) at every reference pose. A constant
 shift of the flange is left free in that fit: link n and the hand-eye transform are one displacement that no data can
 divide between them (METHOD.md 3), and without that freedom their priors would move the base by millimetres.
@@ -12,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrate.robot_terms import RobotTerm, deflection_rad, load_basis
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
 ARM_MM = 400.0
 """Distance from the flange at which work is measured: how much orientation counts against position."""
-MAX_REFERENCES = 60
+MAX_REFERENCES = 150
 _CORNERS_MM = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
 _ROUNDS = 8
 
@@ -35,11 +37,14 @@ class Datum:
     """(k, n) poses over which the fit was made; (0, 0) for `controller`."""
 
 
-def nominal_robot_datum(model: RobotModel, link_twists: FloatArray, joints_rad: FloatArray) -> Datum:
-    """Best fit of the calibrated to the nominal robot over some poses (m, n); their order does not matter."""
+def nominal_robot_datum(
+    model: RobotModel, link_twists: FloatArray, joints_rad: FloatArray, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
+) -> Datum:
+    """Best fit of the calibrated robot, deflected by its terms, to the nominal one over poses (m, n) in any order."""
     ordered = joints_rad[np.lexsort(joints_rad.T)]
     references = ordered[np.unique(np.linspace(0, len(ordered) - 1, min(MAX_REFERENCES, len(ordered))).round().astype(int))]
-    nominal, solved = mdh.base_from_flange(model, references), mdh.base_from_flange(model, references, link_twists)
+    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, references)
+    nominal, solved = mdh.base_from_flange(model, references), mdh.base_from_flange(model, references, link_twists, deflection)
     base_from_solver, flange_offset = np.eye(4), np.eye(4)
     for _ in range(_ROUNDS):
         moved = base_from_solver @ solved @ flange_offset
@@ -54,14 +59,24 @@ def controller_datum() -> Datum:
     return Datum("controller", np.eye(4), np.zeros((0, 0)))
 
 
-def datum_jacobian(datum: Datum, model: RobotModel | None, link_twists: FloatArray) -> FloatArray:
-    """(6, 6 n) left twist of the solver's base per link twist component: how the fit follows the calibration."""
+def datum_jacobian(
+    datum: Datum, model: RobotModel | None, link_twists: FloatArray, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
+) -> FloatArray:
+    """(6, 6 n + K) left twist of the solver's base per link twist component and term: how the fit follows the calibration.
+
+    Terms that are only considered count too: the arm that the base is fitted by yields as much as the arm that measures.
+    """
+    size = link_twists.size + len(terms)
     if model is None or not len(datum.reference_joints_rad):
-        return np.zeros((6, link_twists.size))
-    frames = mdh.chain(model, datum.reference_joints_rad, link_twists)
+        return np.zeros((6, size))
+    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, datum.reference_joints_rad)
+    frames = mdh.chain(model, datum.reference_joints_rad, link_twists, deflection)
+    load = load_basis(terms, model, datum.reference_joints_rad)
     points = _points(frames[:, -1]).reshape(len(frames), 4, 3)
-    jacobian = np.stack([link_columns(link_twists, frames, points[:, i]) for i in range(4)], axis=1)
-    return -_fit_step(frames[:, -1], jacobian.reshape(-1, link_twists.size))[:6]
+    corners = np.moveaxis(points, 1, 0)
+    by_links = np.stack([link_columns(link_twists, frames, corner) for corner in corners], axis=1)
+    by_terms = np.stack([term_columns(link_twists, frames, load, corner) for corner in corners], axis=1)
+    return -_fit_step(frames[:, -1], np.concatenate([by_links, by_terms], axis=-1).reshape(-1, size))[:6]
 
 
 def _fit_step(base_from_flange: FloatArray, wanted_motion: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.cell import Cell, Limits
 from calibrate.datum import nominal_robot_datum
+from calibrate.datum_poses import datum_joints
 from calibrate.external_points import ExternalPoints
 from calibrate.external_result import external_names, external_result
 from calibrate.external_solve import SPARE_ROWS, ExternalSolved, predicted_rms_mm, rms_mm, rows_without_pose_noise
@@ -80,7 +81,8 @@ def robot_alone_result(
     points, model = problem.external, problem.model
     if points is None or model is None:
         raise DataError("there are no external points", remedy="Give shots with reference, target and point_in_reference_mm.")
-    datum = nominal_robot_datum(model, state.link_twists, points.joints_rad)
+    over = datum_joints(model, cell.work_volume_box_mm, points.joints_rad)
+    datum = nominal_robot_datum(model, state.link_twists, over, problem.terms, state.terms_rad)
     held_out, predicted = rms_mm(solved.held_out_mm), predicted_rms_mm(solved.solution)
     scale = max(1.0, (held_out / predicted) ** 2) if np.isfinite(held_out) else 1.0
     covariance, rank = solved.solution.covariance * scale, robot_rank(solved)

@@ -16,6 +16,7 @@ from calibrate.arm_branches import unseen_branch
 from calibrate.assemble import Assembled
 from calibrate.clouds import Solution
 from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.datum_poses import datum_joints
 from calibrate.design_shots import Expectation
 from calibrate.external_result import external_names, external_result
 from calibrate.external_solve import predicted_rms_mm, rms_mm
@@ -56,7 +57,8 @@ def make_result(
     datum = controller_datum()
     joints, used = _all_joints(problem), problem.n_shots + (0 if problem.external is None else problem.external.n_shots)
     if problem.model is not None and joints is not None:
-        datum = nominal_robot_datum(problem.model, state.link_twists, joints)
+        over = datum_joints(problem.model, cell.work_volume_box_mm, joints)
+        datum = nominal_robot_datum(problem.model, state.link_twists, over, problem.terms, state.terms_rad)
     trained = predict(problem, state)
     line_profile = not problem.along_sight
     held_out_rms = solved.held_out.radial_rms_mm if line_profile else solved.held_out.centre_rms_mm

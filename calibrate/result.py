@@ -215,12 +215,14 @@ class Calibration:
             frames = self._chain(self.model, q)
             moved = link_columns(self.link_twists, frames, in_solver_base)
             rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
-            blocks.append(moved + rigid @ datum_jacobian(self.datum, self.model, self.link_twists))
+            of_base = rigid @ datum_jacobian(self.datum, self.model, self.link_twists, self.terms, self.terms_rad)
+            blocks.append(moved + of_base[..., : self.link_twists.size])
         blocks.append(twist_columns(flange, in_solver_base))
         basis = self.camera_error.basis(points)
         blocks.append(base_from_camera[:, :3, :3][:, :, self.camera_error.axis] * basis[:, None, :])
         if self.model is not None and self.terms:
-            blocks.append(term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base))
+            yielded = term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base)
+            blocks.append(yielded + of_base[..., self.link_twists.size :])
         return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
 
     def to_json_dict(self) -> dict[str, object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from tests.support.bound import recover
 from tests.support.unseen import random_unseen_lengths
+from tests.support.volume import UNSEEN, calibrated, random_shots, volume_cell
 
 pytestmark = pytest.mark.qualify
 
@@ -45,3 +47,25 @@ def test_intervals_of_unseen_lengths_cover_95_percent(tmp_path: Path) -> None:
         end="",
     )
     assert 0.90 <= covered <= 0.98
+
+
+N_RECALIBRATIONS = 20
+
+
+def test_recalibrations_move_no_point_by_more_than_its_uncertainty() -> None:
+    """The stated base: 20 calibrations of one cell, other random poses each time, seen at places that none of them saw."""
+    volume = volume_cell(4242, "bar3")
+    test = random_shots(volume, tuple(UNSEEN), 4, np.random.default_rng(4242), noise=False, n_points=5)
+    places, expanded = [], []
+    for seed in range(N_RECALIBRATIONS):
+        shots = random_shots(volume, volume.spheres, 15, np.random.default_rng([4242, seed]), n_points=300)
+        found = calibrated(volume, shots)
+        places.append([found.points_in_base_mm(shot.points_in_camera_mm, joints_rad=shot.joints_rad) for shot in test.shots])
+        covariance = [found.point_covariance_in_base_mm2(shot.points_in_camera_mm, joints_rad=shot.joints_rad) for shot in test.shots]
+        expanded.append([2 * np.sqrt(np.linalg.eigvalsh(c)[:, -1]) for c in covariance])
+    where = np.array(places)
+    pairs = list(combinations(range(N_RECALIBRATIONS), 2))
+    moved = np.array([np.linalg.norm(where[a] - where[b], axis=-1) for a, b in pairs])
+    stated = np.array([np.minimum(expanded[a], expanded[b]) for a, b in pairs])
+    print(f"\nqualify datum: largest motion {moved.max():.3f} mm, of its U {np.max(moved / stated):.2f}, median U {np.median(stated):.3f} mm", end="")
+    assert (moved <= stated).all()

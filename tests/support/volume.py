@@ -15,8 +15,10 @@ from acquire.sphere import fit_fixed_radius
 from acquire.visibility import CameraView, camera_view
 from calibrate.camera_error import correction_in_camera_mm
 from calibrate.observations import Observations, SphereShot
+from calibrate.report_figures import make_result
+from calibrate.result import Calibration
 from calibrate.robot_terms import deflection_rad
-from calibrate.solve import Solved
+from calibrate.solve import CalibrationSettings, Solved, solve_observations
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
@@ -26,6 +28,7 @@ from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.draws import PAPER_FLANGE_FROM_CAMERA, Sizes, random_truth
 from drivers.simulated.sampling import observe_sphere
 from drivers.simulated.truth import SphereTruth
+from tests.support.solving import one_thread
 
 DIAMETER_MM = 38.1
 LENGTH_U_MM = 0.005
@@ -127,6 +130,26 @@ def observed(
         radius_mm=DIAMETER_MM / 2,
         centre_in_camera_mm=centre,
     )
+
+
+def calibrated(volume: VolumeCell, shots: Observations, settings: CalibrationSettings | None = None) -> Calibration:
+    """The calibration of some shots, as `calibrate` makes it of a session that holds them."""
+    settings = settings or CalibrationSettings()
+    with one_thread():
+        solved, compared = solve_observations(shots, volume.cell, volume.model, settings)
+        return make_result(
+            solved,
+            method=settings.method,
+            cell=volume.cell,
+            sessions=[],
+            n_shots=len(shots.shots),
+            notes=(),
+            compared=compared,
+            rejected=shots.rejected + solved.rejected,
+            created_utc="2026-01-01T00:00:00Z",
+            software="tests",
+            began=0.0,
+        )
 
 
 def measured_centres(solved: Solved, observations: Observations) -> dict[str, FloatArray]:

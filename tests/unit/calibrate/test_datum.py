@@ -8,7 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from calibrate.datum import ARM_MM, controller_datum, datum_jacobian, nominal_robot_datum
+from calibrate.datum import ARM_MM, MAX_REFERENCES, controller_datum, datum_jacobian, nominal_robot_datum
+from calibrate.datum_poses import datum_joints, work_volume_joints
+from calibrate.robot_terms import arm_terms
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -116,3 +118,32 @@ def test_a_controllers_base_is_taken_as_it_is() -> None:
     datum = controller_datum()
     np.testing.assert_array_equal(datum.base_from_solver, np.eye(4))
     np.testing.assert_array_equal(datum_jacobian(datum, None, np.zeros((0, 6))), np.zeros((6, 0)))
+
+
+@robots
+def test_the_datum_follows_what_the_arm_yields_by(model: RobotModel) -> None:
+    xi, q, terms = twists(12, 0.0), joints(12), arm_terms(model)
+    still = np.zeros(len(terms))
+    jacobian = datum_jacobian(nominal_robot_datum(model, xi, q, terms, still), model, xi, terms, still)
+    assert jacobian.shape == (6, 36 + len(terms))
+    for k in range(len(terms)):
+        step = 1e-5 * np.eye(len(terms))[k]
+        forward, back = (nominal_robot_datum(model, xi, q, terms, sign * step).base_from_solver for sign in (1, -1))
+        moved = (se3.log(forward) - se3.log(back)) / 2e-5
+        np.testing.assert_allclose(jacobian[:3, 36 + k], moved[:3], atol=0.05)
+        np.testing.assert_allclose(jacobian[3:, 36 + k], moved[3:], atol=5e-5)
+
+
+@robots
+def test_the_work_volume_decides_the_reference_poses_and_nothing_else(model: RobotModel) -> None:
+    box = np.array([[640.0, -330.0, 130.0], [1120.0, 330.0, 560.0]])
+    found = work_volume_joints(model, box)
+    assert found.shape == (MAX_REFERENCES, 6)
+    assert mdh.within_limits(model, found).all()
+    flange = mdh.base_from_flange(model, found)
+    ahead = flange[:, :3, 3] + ARM_MM * flange[:, :3, 2]
+    assert (np.linalg.norm(ahead - np.clip(ahead, box[0], box[1]), axis=1) < 30.0).all()
+    # spread through the box, not along one edge of it
+    assert (np.ptp(ahead, axis=0) > 0.8 * np.ptp(box, axis=0)).all()
+    np.testing.assert_array_equal(datum_joints(model, box, joints(1)), datum_joints(model, box, joints(2)))
+    np.testing.assert_array_equal(datum_joints(model, None, joints(1)), joints(1))
