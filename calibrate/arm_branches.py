@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.clouds import Solution
-from calibrate.datum import link_columns, twist_columns
+from calibrate.datum import link_columns, term_columns, twist_columns
 from calibrate.problem import Problem
+from calibrate.robot_terms import load_basis
 from drivers.errors import SettingsError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.closed_form import arm_geometry
@@ -100,10 +101,14 @@ def _between(problem: Problem, solution: Solution, covariance: FloatArray, shot:
 
 
 def _motion(problem: Problem, solution: Solution, joints_rad: FloatArray, centres_in_base_mm: FloatArray) -> FloatArray:
-    """(m, 3, p) of points (m, 3) per unknown of links and hand-eye."""
-    model, state = problem.model, solution.state
+    """(m, 3, p) of points (m, 3) per unknown of links, hand-eye and arm; the camera, which sees the same in both branches, left at zero."""
+    model, state, layout = problem.model, solution.state, problem.layout
     if model is None:
         raise SettingsError("branches need a robot model", remedy="Calibrate with axis angles.")
     frames = mdh.chain(model, joints_rad, state.link_twists)
-    links = link_columns(state.link_twists, frames, centres_in_base_mm)
-    return np.concatenate([links, twist_columns(frames[:, -1], centres_in_base_mm)], axis=-1)
+    rows = np.zeros((len(joints_rad), 3, layout.n_geometric))
+    rows[..., layout.links] = link_columns(state.link_twists, frames, centres_in_base_mm)
+    rows[..., layout.hand_eye] = twist_columns(frames[:, -1], centres_in_base_mm)
+    if problem.terms:
+        rows[..., layout.terms] = term_columns(state.link_twists, frames, load_basis(problem.terms, model, joints_rad), centres_in_base_mm)
+    return rows

@@ -89,9 +89,9 @@ class Identifiability:
             "expected_rank": self.expected_rank,
             "n_parameters": self.n_parameters,
             "condition": self.condition,
-            "gap": self.gap,
+            "gap": self.gap if np.isfinite(self.gap) else None,
             "observability": None if self.observability is None else asdict(self.observability),
-            "singular_values": self.singular_values,
+            "singular_values": self.singular_values.tolist(),
             "directions": [asdict(group) for group in self.directions],
         }
 

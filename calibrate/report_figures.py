@@ -14,9 +14,12 @@ from acquire.cell import Cell
 from acquire.plan import PlannedPose
 from calibrate.arm_branches import unseen_branch
 from calibrate.assemble import Assembled
+from calibrate.budget import ErrorBudget, error_budget
+from calibrate.camera_field import seen_cells
 from calibrate.clouds import Solution
 from calibrate.datum import controller_datum, nominal_robot_datum
 from calibrate.datum_poses import datum_joints
+from calibrate.design_cell import work_box_mm
 from calibrate.design_shots import Expectation
 from calibrate.external_result import external_names, external_result
 from calibrate.external_solve import predicted_rms_mm, rms_mm
@@ -26,6 +29,7 @@ from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
+from calibrate.sources import artefact_covariance
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
 from calibrate.verdict import Evidence, judge, wants_more_poses
 from drivers.files.session import Session
@@ -135,7 +139,9 @@ def make_result(
         external=external_result(problem, state, datum, covariance, solved.external_held_out_mm, external_predicted),
         identifiability=identifiability,
         next_best_poses=next_poses,
+        seen_cells=seen_cells(problem.points_in_camera_mm) if len(problem.points_in_camera_mm) else None,
     )
+    result = replace(result, error_budget=_budget(result, cell, assembled, solution, scale))
     return replace(result, id=str(calibration_data(result)["id"]))
 
 
@@ -144,6 +150,15 @@ def _all_joints(problem: Problem) -> FloatArray | None:
     if problem.joints_rad is None:
         return None
     return problem.joints_rad if problem.external is None else np.concatenate([problem.joints_rad, problem.external.joints_rad])
+
+
+def _budget(result: Calibration, cell: Cell, assembled: Assembled, solution: Solution, scale: float) -> ErrorBudget | None:
+    if not result.shots:
+        return None
+    centres = np.array([result.sphere_centres_in_base_mm[name] for name in assembled.sphere_names])
+    region = "around the spheres" if cell.work_volume_mm is None else "work volume"
+    artefact, joints = scale * artefact_covariance(solution), assembled.problem.joints_rad
+    return error_budget(result, work_box_mm(cell, centres), region, artefact=artefact, joints_rad=joints)
 
 
 def _next_poses(cell: Cell, assembled: Assembled, solution: Solution) -> tuple[PlannedPose, ...]:

@@ -16,7 +16,10 @@ from numpy.typing import ArrayLike
 
 from acquire.cell import Limits
 from acquire.plan import PlannedPose
-from calibrate.camera_error import CameraError, correction_in_camera_mm
+from calibrate.budget import ErrorBudget
+from calibrate.camera_error import CameraError
+from calibrate.camera_field import SHAPE as SEEN_SHAPE
+from calibrate.camera_field import CameraField, SeenCells, camera_field, correction_mm
 from calibrate.datum import Datum, datum_jacobian, link_columns, term_columns, twist_columns
 from calibrate.external_result import ExternalResult
 from calibrate.identifiability import Identifiability
@@ -125,6 +128,10 @@ class Calibration:
     """What the shots determined and what not; None in files of older versions."""
     next_best_poses: tuple[PlannedPose, ...] = ()
     """Poses that would tell most next, best first, where the verdict asks for more."""
+    seen_cells: SeenCells | None = None
+    """Where in `camera_seen_volume_mm` points were seen; None in files of older versions."""
+    error_budget: ErrorBudget | None = None
+    """What a measured point is uncertain by, and why; None where no sphere was seen, and in files of older versions."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -159,9 +166,7 @@ class Calibration:
     def corrected_points_in_camera_mm(self, points_in_camera_mm: ArrayLike) -> FloatArray:
         """Points (n, 3) with the camera's error taken out, still in the camera frame; NaN rows stay NaN."""
         points = _points(points_in_camera_mm)
-        if not len(self.camera_mm):
-            return points.copy()
-        return points + correction_in_camera_mm(self.camera_error, self.camera_mm, points)
+        return points + self.camera_correction_mm(points)
 
     def points_in_base_mm(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
@@ -247,17 +252,39 @@ class Calibration:
             "seconds": s.seconds,
             **({} if self.external is None else {"external": self.external.to_json_dict(), "hand_eye": self.hand_eye}),
             "identifiability": None if self.identifiability is None else self.identifiability.to_json_dict(),
-            "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in self.next_best_poses],
+            "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad.tolist()} for pose in self.next_best_poses],
+            "error_budget": None if self.error_budget is None else self.error_budget.to_json_dict(),
         }
+
+    def camera_correction_mm(self, points_in_camera_mm: ArrayLike) -> FloatArray:
+        """(n, 3) what is added to points (n, 3) of the camera, rigid part and all; `camera_field` tells how well it is known."""
+        return correction_mm(self.camera_error, self.camera_mm, _points(points_in_camera_mm))
+
+    def camera_field(self, points_in_camera_mm: ArrayLike) -> CameraField:
+        """The correction at points (n, 3) with covariance, its rigid part taken out: what the hand-eye transform cannot take over."""
+        first = 6 * len(self.link_twists) + 6
+        part = slice(first, first + len(self.camera_mm))
+        return camera_field(self.camera_error, self.camera_mm, self.covariance[part, part], self.cells, _points(points_in_camera_mm))
+
+    @property
+    def cells(self) -> SeenCells:
+        """`seen_cells`, or the whole seen box where an older file does not tell."""
+        return self.seen_cells or SeenCells(self.camera_seen_volume_mm, np.ones(SEEN_SHAPE, dtype=np.bool_))
+
+    def noise_covariances_mm2(self, points_in_camera_mm: FloatArray, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n, 3, 3) twice: what pose noise and what noise of the point add in one shot, for points (n, 3) at poses (n, 4, 4)."""
+        base_from_camera = base_from_flange @ self.flange_from_camera
+        lever = se3.hat(se3.apply(base_from_camera, points_in_camera_mm) - base_from_flange[:, :3, 3])
+        pose = self.noise.pose_mm**2 * np.eye(3) + self.noise.pose_rad**2 * lever @ np.swapaxes(lever, -1, -2)
+        unit = points_in_camera_mm / np.linalg.norm(points_in_camera_mm, axis=1, keepdims=True)
+        sight = np.einsum("nij,nj->ni", base_from_camera[:, :3, :3], unit)
+        along = (self.noise.point_mm**2 + self.noise.form_mm**2) / _MEAN_SQUARE_COSINE
+        return np.asarray(pose), np.asarray(along * sight[:, :, None] * sight[:, None, :])
 
     def _shot_covariance(self, points: FloatArray, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None) -> FloatArray:
         flange = np.broadcast_to(self._flange(joints_rad, base_from_flange, len(points)), (len(points), 4, 4))
-        base_from_camera = flange @ self.flange_from_camera
-        lever = se3.hat(se3.apply(base_from_camera, points) - flange[:, :3, 3])
-        pose = self.noise.pose_mm**2 * np.eye(3) + self.noise.pose_rad**2 * lever @ np.swapaxes(lever, -1, -2)
-        sight = np.einsum("nij,nj->ni", base_from_camera[:, :3, :3], points / np.linalg.norm(points, axis=1, keepdims=True))
-        along = (self.noise.point_mm**2 + self.noise.form_mm**2) / _MEAN_SQUARE_COSINE
-        return np.asarray(pose + along * sight[:, :, None] * sight[:, None, :])
+        pose, point = self.noise_covariances_mm2(points, flange)
+        return pose + point
 
     def _flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:
         return self.datum.base_from_solver @ self._solver_flange(joints_rad, base_from_flange, n_points)

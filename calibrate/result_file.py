@@ -14,7 +14,9 @@ import numpy as np
 
 from acquire.cell import Limits
 from acquire.plan import PlannedPose
+from calibrate.budget import ErrorBudget
 from calibrate.camera_error import camera_error_from_settings
+from calibrate.camera_field import seen_cells_data, seen_cells_from_data
 from calibrate.datum import Datum
 from calibrate.external_result import external_data, external_from_data
 from calibrate.identifiability import Identifiability
@@ -62,7 +64,8 @@ def calibration_data(c: Calibration) -> dict[str, object]:
             for t, value in zip(c.terms, c.terms_rad, strict=True)
         ],
         "flange_from_camera": c.flange_from_camera,
-        "camera_error": {**c.camera_error.settings(), "coefficients_mm": c.camera_mm, "seen_volume_mm": c.camera_seen_volume_mm},
+        "camera_error": {**c.camera_error.settings(), "coefficients_mm": c.camera_mm, "seen_volume_mm": c.camera_seen_volume_mm}
+        | seen_cells_data(c.seen_cells),
         "radius_offset_mm": c.radius_offset_mm,
         "spheres": {
             name: {"centre_in_base_mm": centre, "radius_offset_mm": c.sphere_radius_offsets_mm[name]}
@@ -73,7 +76,8 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         "noise": asdict(c.noise),
         "statistics": {key: value for key, value in asdict(c.statistics).items() if key != "seconds"},
         "identifiability": None if c.identifiability is None else c.identifiability.to_json_dict(),
-        "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in c.next_best_poses],
+        "next_best_poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad.tolist()} for pose in c.next_best_poses],
+        "error_budget": None if c.error_budget is None else c.error_budget.to_json_dict(),
         "parameters": {
             "names": list(c.parameter_names),
             "sigma": np.sqrt(np.maximum(np.diagonal(c.covariance), 0.0)),
@@ -130,7 +134,7 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
     spheres = {name: _mapping(sphere) for name, sphere in _mapping(data["spheres"]).items()}
     datum, parameters = _mapping(data["datum"]), _mapping(data["parameters"])
     limits = data["limits"]
-    model_settings = {key: value for key, value in camera.items() if key not in ("coefficients_mm", "seen_volume_mm")}
+    model_settings = {key: value for key, value in camera.items() if key not in ("coefficients_mm", "seen_volume_mm", "seen_cells")}
     return kind(
         id=str(data["id"]),
         method=str(data["method"]),
@@ -166,6 +170,8 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         # sections that files of older versions lack
         identifiability=None if data.get("identifiability") is None else Identifiability.from_json_dict(_mapping(data["identifiability"])),
         next_best_poses=tuple(_pose(_mapping(pose)) for pose in _sequence(data.get("next_best_poses", []))),
+        seen_cells=seen_cells_from_data(camera["seen_cells"], _array(camera["seen_volume_mm"])) if "seen_cells" in camera else None,
+        error_budget=None if data.get("error_budget") is None else ErrorBudget.from_json_dict(_mapping(data["error_budget"])),
     )
 
 

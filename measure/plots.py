@@ -70,7 +70,7 @@ def centres_svg(before_mm: FloatArray | None, after_mm: FloatArray, *, axes: tup
             panel.set_xlabel(f"{names[axes[0]]} in base, mm")
         panels[0].set_ylabel(f"{names[axes[1]]} in base, mm")
 
-    return _svg(draw, salt=f"centres{axes}", size=(6.4, 3.3))
+    return svg_of(draw, salt=f"centres{axes}", size=(6.4, 3.3))
 
 
 def shots_svg(series: Sequence[ShotSeries], *, rejected: FloatArray, ylabel: str, limit_mm: float | None = None) -> str:
@@ -89,9 +89,9 @@ def shots_svg(series: Sequence[ShotSeries], *, rejected: FloatArray, ylabel: str
         axis.set_xlabel("shot")
         axis.set_ylabel(ylabel)
         if series or rejected.size:
-            _legend_above(axis, len(series) + 2)
+            legend_above(axis, len(series) + 2)
 
-    return _svg(draw, salt="shots" + ylabel, size=(6.4, 3.0))
+    return svg_of(draw, salt="shots" + ylabel, size=(6.4, 3.0))
 
 
 def coverage_svg(
@@ -118,31 +118,9 @@ def coverage_svg(
         plot.set_ylabel("depth z in camera, mm")
         plot.invert_yaxis()
         plot.set_aspect("equal", adjustable="datalim")
-        _legend_above(plot, 2)
+        legend_above(plot, 2)
 
-    return _svg(draw, salt=f"coverage{axis}", size=(4.6, 4.6))
-
-
-def depth_map_svg(correction_mm: Callable[[FloatArray], FloatArray], seen_mm: FloatArray, *, axis: int) -> str:
-    """Depth correction (of points (n, 3) to (n, 3)) over one lateral axis and depth, in the middle of the other axis."""
-    lateral, depth = (np.linspace(seen_mm[0, a], seen_mm[1, a], 61) for a in (axis, 2))
-    grid = np.tile(seen_mm.mean(axis=0), (61 * 61, 1))
-    grid[:, axis], grid[:, 2] = (a.ravel() for a in np.meshgrid(lateral, depth))
-    values = correction_mm(grid)[:, 2].reshape(61, 61)
-
-    def draw(figure: Any) -> None:
-        plot = figure.subplots()
-        size = max(float(np.nanmax(np.abs(values))), 1e-3)
-        image = plot.contourf(lateral, depth, values, levels=np.linspace(-size, size, 21), cmap="RdBu_r")
-        lines = plot.contour(lateral, depth, values, levels=8, colors="#374151", linewidths=0.5)
-        plot.clabel(lines, fmt="%.2g", fontsize=8)
-        figure.colorbar(image, ax=plot, label="added to z, mm", format="%.2g", ticks=np.linspace(-size, size, 5))
-        plot.set_xlabel(f"{'xy'[axis]} in camera, mm")
-        plot.set_ylabel("depth z in camera, mm")
-        plot.invert_yaxis()
-        plot.grid(visible=False)
-
-    return _svg(draw, salt=f"depth{axis}", size=(4.9, 4.0))
+    return svg_of(draw, salt=f"coverage{axis}", size=(4.6, 4.6))
 
 
 def lengths_svg(after: Sequence[LengthBar], before: Mapping[str, float], *, limit_mm: float | None) -> str:
@@ -162,9 +140,9 @@ def lengths_svg(after: Sequence[LengthBar], before: Mapping[str, float], *, limi
         axis.set_yticks(rows, [bar.label for bar in after])
         axis.set_ylim(len(after) - 0.5, -0.5)
         axis.set_xlabel("measured - reference, mm")
-        _legend_above(axis, 3)
+        legend_above(axis, 3)
 
-    return _svg(draw, salt="lengths", size=(6.4, 1.5 + 0.34 * len(after)))
+    return svg_of(draw, salt="lengths", size=(6.4, 1.5 + 0.34 * len(after)))
 
 
 def _scatter(panel: Any, points_mm: FloatArray, axes: tuple[int, int], colour: str, label: str) -> None:
@@ -181,12 +159,13 @@ def _scatter(panel: Any, points_mm: FloatArray, axes: tuple[int, int], colour: s
     panel.set_title(f"{label}: {rms:.3f} mm rms", fontsize=10, color=colour)
 
 
-def _legend_above(axis: Any, columns: int) -> None:
+def legend_above(axis: Any, columns: int) -> None:
+    """A legend over the plot of a matplotlib axis, where it hides nothing."""
     axis.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, borderaxespad=0.2, handletextpad=0.4, columnspacing=1.0)
 
 
-def _svg(draw: Callable[[Any], None], *, salt: str, size: tuple[float, float]) -> str:
-    """Draw on a figure of its own; ids carry the salt, since several pictures share one page."""
+def svg_of(draw: Callable[[Any], None], *, salt: str, size: tuple[float, float]) -> str:
+    """The SVG of what `draw` puts on a figure of its own; ids carry the salt, since several pictures share one page."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

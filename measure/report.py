@@ -17,7 +17,8 @@ from drivers.kinematics.se3 import FloatArray
 from measure import plots
 from measure.plots import AFTER_COLOUR, LengthBar, ShotSeries
 from measure.report_facts import facts_of
-from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual
+from measure.report_insight import budget_pictures, budget_tables, field_pictures, field_tables, identifiability_tables
+from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual, Table
 from measure.report_text import (
     calibration_rows,
     decision_text,
@@ -96,7 +97,7 @@ def page_of(facts: CalibrationFacts, verification: VerifyResult | None, moment: 
         rows=result_rows(facts, verification),
         reasons=facts.reasons if verification is None else verification.reasons,
         next_steps=next_steps_of(facts, verification),
-        tables=tables_of(facts, verification),
+        tables=(*tables_of(facts, verification), *_insight_tables(facts)),
         pictures=tuple(_pictures(facts, verification)),
         calibration_rows=calibration_rows(facts),
         identity=identity_of(facts, verification),
@@ -106,6 +107,11 @@ def page_of(facts: CalibrationFacts, verification: VerifyResult | None, moment: 
     )
 
 
+def _insight_tables(facts: CalibrationFacts) -> tuple[Table, ...]:
+    field = field_tables(facts.camera_field, facts.seen_cells)
+    return (*budget_tables(facts.error_budget), *field, *identifiability_tables(facts.identifiability))
+
+
 def _pictures(facts: CalibrationFacts, verification: VerifyResult | None) -> list[Picture]:
     found: list[Picture] = []
     if verification is not None:
@@ -113,11 +119,8 @@ def _pictures(facts: CalibrationFacts, verification: VerifyResult | None) -> lis
         found += _length_picture(verification)
     found += _shot_picture(facts, verification)
     found += _coverage_pictures(facts, verification)
-    if facts.correction_mm is not None and facts.seen_mm is not None:
-        for axis in (0, 1):
-            caption = f"What the calibration adds to the depth of a point, over {'xy'[axis]} and depth, in the middle of the seen volume."
-            svg = plots.depth_map_svg(facts.correction_mm, facts.seen_mm, axis=axis)
-            found.append(Picture(f"Camera correction, {'xy'[axis]}-z", caption, svg))
+    found += field_pictures(facts.camera_field, facts.seen_cells, facts.working_range_mm, facts.field_of_view_deg)
+    found += budget_pictures(facts.error_budget)
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -50,15 +50,12 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         seen_mm=calibration.camera_seen_volume_mm,
         working_range_mm=None if cell is None else cell.camera.working_range_mm,
         limits=calibration.limits,
-        correction_mm=None if not len(calibration.camera_mm) else _correction(calibration),
+        field_of_view_deg=None if cell is None else cell.camera.field_of_view_deg,
+        camera_field=calibration.camera_field if len(calibration.camera_mm) else None,
+        seen_cells=calibration.cells,
+        identifiability=calibration.identifiability,
+        error_budget=calibration.error_budget,
     )
-
-
-def _correction(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
-    def correction_mm(points_in_camera_mm: FloatArray) -> FloatArray:
-        return calibration.corrected_points_in_camera_mm(points_in_camera_mm) - points_in_camera_mm
-
-    return correction_mm
 
 
 def _camera_error_text(calibration: Calibration) -> str:

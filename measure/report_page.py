@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from acquire.cell import Limits
+from calibrate.budget import ErrorBudget
+from calibrate.camera_field import CameraField, SeenCells
+from calibrate.identifiability import Identifiability
 from drivers.kinematics.se3 import FloatArray
 
 
@@ -51,8 +54,13 @@ class CalibrationFacts:
     """(2, 3) corners of the camera volume with data."""
     working_range_mm: tuple[float, float] | None = None
     limits: Limits | None = None
-    correction_mm: Callable[[FloatArray], FloatArray] | None = None
-    """Correction (n, 3) of camera points (n, 3); None where the camera is taken as it is."""
+    field_of_view_deg: tuple[float, float] | None = None
+    camera_field: Callable[[FloatArray], CameraField] | None = None
+    """The camera's correction at points (n, 3), with covariance; None where the camera is taken as it is."""
+    seen_cells: SeenCells | None = None
+    """Where in the camera's view points were measured."""
+    identifiability: Identifiability | None = None
+    error_budget: ErrorBudget | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +94,8 @@ class Picture:
     title: str
     caption: str
     svg: str
+    wide: bool = False
+    """Whether it takes the whole width of the page."""
 
 
 @dataclass(frozen=True, slots=True)

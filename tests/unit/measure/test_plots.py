@@ -8,7 +8,20 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from measure import plots
+from calibrate.camera_field import CameraField
+from measure import plots, plots_maps
+
+
+def depth_slice(depth_mm: float, slope: float) -> plots_maps.DepthSlice:
+    x, y = np.linspace(-100, 100, 21), np.linspace(-60, 60, 13)
+    points = plots_maps.grid_mm(x, y, depth_mm)
+    field = CameraField(slope * points, np.tile(1e-6 * np.eye(3), (len(points), 1, 1)), points[:, 0] < 40)
+    return plots_maps.DepthSlice.of_field(depth_mm, x, y, field)
+
+
+def profile(label: str) -> plots_maps.DepthProfile:
+    depth = np.linspace(250.0, 450.0, 30)
+    return plots_maps.DepthProfile(label, depth, np.sin(depth), np.full(30, 0.1), depth < 400)
 
 
 def pictures() -> dict[str, str]:
@@ -24,8 +37,11 @@ def pictures() -> dict[str, str]:
         "shots": plots.shots_svg([series], rejected=np.array([3.0]), ylabel="distance, mm", limit_mm=0.1),
         "no shots": plots.shots_svg([], rejected=np.zeros(0), ylabel="radial rms, mm"),
         "coverage": plots.coverage_svg({"calibration": (camera, plots.AFTER_COLOUR)}, axis=1, working_range_mm=(250, 450), seen_mm=seen),
-        "depth": plots.depth_map_svg(lambda p: 1e-3 * p, seen, axis=0),
-        "no depth error": plots.depth_map_svg(np.zeros_like, seen, axis=1),
+        "depth": plots_maps.depth_slices_svg([depth_slice(z, 1e-3) for z in (280.0, 340.0, 400.0)]),
+        "no depth error": plots_maps.depth_slices_svg([depth_slice(340.0, 0.0)]),
+        "profiles": plots_maps.depth_profiles_svg([profile(name) for name in ("left", "right")]),
+        "budget": plots_maps.budget_map_svg(np.arange(5.0), np.arange(4.0), np.where(rng.random((4, 5)) < 0.2, np.nan, rng.random((4, 5)))),
+        "no budget": plots_maps.budget_map_svg(np.arange(2.0), np.arange(2.0), np.zeros((2, 2))),
         "lengths": plots.lengths_svg(bars, {"A-B": 1.2}, limit_mm=0.2),
     }
 

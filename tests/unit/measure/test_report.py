@@ -136,7 +136,7 @@ def without_pictures(calibration: Calibration) -> Calibration:
 
 def test_bare_facts_make_a_page_too(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
     """No limits, no first guess, no lengths, no camera model, no shots."""
-    facts = replace(facts_of(calibration), limits=None, shots=(), correction_mm=None, seen_mm=None, cross_validated_rms_mm=None, rejected=())
+    facts = replace(facts_of(calibration), limits=None, shots=(), camera_field=None, seen_mm=None, cross_validated_rms_mm=None, rejected=())
     bare = replace(verification, before=None, lengths=(), before_length_errors_mm={}, limits=None, judgements=(), verdict="not_proven", reasons=())
     text, _ = read(write_page(tmp_path / "report.html", facts, bare))
     assert "Not proven" in text
