@@ -105,13 +105,13 @@ def budget_tables(budget: ErrorBudget | None) -> tuple[Table, ...]:
     if budget is None:
         return ()
     lead = (
-        f"Standard uncertainties in mm (k = 1), root mean square over {budget.n_places} places of the {_region(budget)}, for views like those of "
-        "the calibration. The shots know sums of robot, hand-eye and camera better than each alone: what cancels in every shot cancels in a "
-        "measurement too, so the shares do not add up, and the line of the four together counts. Points are in the base frame as defined; what "
-        f"moves all of them alike cancels in lengths. The largest of any place is {budget.largest_point_mm:.3f} mm."
+        f"Standard uncertainties in mm (k = 1; of a point in all directions together), root mean square over {budget.n_places} places of the "
+        f"{_region(budget)}, for views like those of the calibration. The shots know sums of robot, hand-eye and camera better than each alone: what "
+        "cancels in every shot cancels in a measurement too, so the shares do not add up, and the line of the four together counts. Points are in "
+        f"the base frame as defined; what moves all of them alike cancels in lengths. The largest of any place is {budget.largest_point_mm:.3f} mm."
     )
     rows = tuple((text, _mm(budget.point, name), _mm(budget.length, name)) for name, text in _BLOCKS)
-    heads = ("share", "a point, all directions", f"a length of {budget.length_mm:.0f} mm")
+    heads = ("share", "a point", f"{budget.length_mm:.0f} mm length")
     return (Table("Error budget", lead, heads, rows),)
 
 
