@@ -116,21 +116,26 @@ class LineClient:
                 if line is not None and line.number == self._number:
                     return line
                 if line is not None and line.number == 0 and line.word == Code.ERROR:
-                    return None  # ours came broken
+                    self._count_foreign("our lines arrive broken there")
+                    return None
         return None
 
     def _decoded(self, data: bytes) -> Line | None:
         try:
             line = decode(data)
         except BadLine as error:
-            self._foreign += 1
-            if self._foreign >= _MOST_FOREIGN_LINES:
-                remedy = "Is spherecal.mod the program that listens there? On a serial line, is the baud rate the same on both sides?"
-                found = f"what answers is not the program of spherecal: {error.message}"
-                raise WrongController(found, where=self.link.name, remedy=remedy) from error
+            self._count_foreign(error.message)
             return None
-        self._foreign = 0
+        if line.number != 0:
+            self._foreign = 0
         return line
+
+    def _count_foreign(self, found: str) -> None:
+        """Disturbed lines are asked for again; a few in a row are no disturbance."""
+        self._foreign += 1
+        if self._foreign >= _MOST_FOREIGN_LINES:
+            remedy = "Is spherecal.mod the program that listens there? On a serial line, is the baud rate the same on both sides?"
+            raise WrongController(f"what answers is not the program of spherecal: {found}", where=self.link.name, remedy=remedy)
 
     def _checked(self, line: Line, verb: Verb) -> Line:
         if line.word == Code.ERROR:

@@ -316,6 +316,7 @@ MODULE Spherecal
             SphReply "L "+NumToStr(sphEpoch,0)+" "+NumToStr(sphLastToken,0)+" "+NumToStr(sphOutcome,0);
         ELSEIF sphWord{2}="STOP" THEN
             sphTokenNo:=0;
+            IF sphGo sphOutcome:=SPH_STOPPED;
             sphGo:=FALSE;
             IF sphMoving sphStop:=TRUE;
             SphReply "S "+NumToStr(sphEpoch,0);

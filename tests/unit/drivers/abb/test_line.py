@@ -143,6 +143,22 @@ def test_a_target_that_comes_back_changed_is_not_started(cell: VirtualCell) -> N
     assert cell.program.n_motions == 0
 
 
+def test_a_line_that_arrives_broken_there_is_sent_again_but_not_for_ever(cell: VirtualCell) -> None:
+    cell.robot.open()
+    broken = encode(0, Code.ERROR, str(int(Fault.CHECKSUM)), "checksum")
+    left = [2]
+
+    def twice(reply: bytes) -> bytes:
+        left[0] -= 1
+        return broken if left[0] >= 0 else reply
+
+    cell.link.spoil = twice
+    cell.robot.read_state()
+    cell.link.spoil = lambda _: broken
+    with pytest.raises(WrongController, match="arrive broken"):
+        cell.robot.read_state()
+
+
 def test_two_hundred_moves_in_a_row_lose_nothing(cell: VirtualCell) -> None:
     """Every seventh reply is lost on the way."""
     cell.robot.open()
