@@ -32,6 +32,7 @@ from calibrate.result_file import calibration_data
 from calibrate.sources import artefact_covariance
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
 from calibrate.verdict import Evidence, judge, wants_more_poses
+from calibrate.volume_lengths import volume_length_uncertainty_mm
 from drivers.files.session import Session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
@@ -74,25 +75,6 @@ def make_result(
     identifiability = identifiability_of(problem, solution)
     names = assembled.sphere_names
     covariance = solution.covariance * scale
-    evidence = Evidence(
-        limits=cell.limits,
-        cross_validated_rms_mm=held_out_rms,
-        length_expanded_uncertainty_mm=_longest_length_uncertainty(assembled, solution, covariance),
-        n_shots=n_shots,
-        used=used,
-        has_joints=has_joints,
-        # a laser tracker's points are lengths in themselves
-        has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
-        line_profile=line_profile,
-        covariance_scale=scale,
-        external_rms_mm=external_rms if np.isfinite(external_rms) else None,
-        shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
-        unseen_branch=unseen_branch(problem, solution, covariance),
-    )
-    verdict, reasons = judge(evidence, identifiability)
-    next_poses = _next_poses(cell, assembled, solution) if wants_more_poses(evidence, identifiability) else ()
-    if next_poses:
-        reasons += (f"next best poses: {'; '.join(map(pose_text, next_poses))}",)
     result = Calibration(
         id="",
         method=method,
@@ -127,8 +109,8 @@ def make_result(
             compared=compared,
         ),
         limits=cell.limits,
-        verdict=verdict,
-        reasons=reasons + notes,
+        verdict="",
+        reasons=(),
         shots=_shot_results(assembled, solution, trained, solved.held_out, datum.base_from_solver),
         rejected=rejected,
         cell_name=cell.name,
@@ -138,10 +120,30 @@ def make_result(
         software=software,
         external=external_result(problem, state, datum, covariance, solved.external_held_out_mm, external_predicted),
         identifiability=identifiability,
-        next_best_poses=next_poses,
         seen_cells=seen_cells(problem.points_in_camera_mm) if len(problem.points_in_camera_mm) else None,
     )
-    result = replace(result, error_budget=_budget(result, cell, assembled, solution, scale))
+    evidence = Evidence(
+        limits=cell.limits,
+        cross_validated_rms_mm=held_out_rms,
+        length_expanded_uncertainty_mm=_length_uncertainty(result, cell, assembled, solution),
+        over_work_volume=_over_work_volume(result, cell),
+        n_shots=n_shots,
+        used=used,
+        has_joints=has_joints,
+        # a laser tracker's points are lengths in themselves
+        has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
+        line_profile=line_profile,
+        covariance_scale=scale,
+        external_rms_mm=external_rms if np.isfinite(external_rms) else None,
+        shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
+        unseen_branch=unseen_branch(problem, solution, covariance),
+    )
+    verdict, reasons = judge(evidence, identifiability)
+    next_poses = _next_poses(cell, assembled, solution) if wants_more_poses(evidence, identifiability) else ()
+    if next_poses:
+        reasons += (f"next best poses: {'; '.join(map(pose_text, next_poses))}",)
+    budget = _budget(result, cell, assembled, solution, scale)
+    result = replace(result, verdict=verdict, reasons=reasons + notes, next_best_poses=next_poses, error_budget=budget)
     return replace(result, id=str(calibration_data(result)["id"]))
 
 
@@ -182,6 +184,18 @@ def _predicted_centre_rms(assembled: Assembled, solution: Solution) -> float:
     covariance, sensitivity = shot_centre_covariance_mm2(problem, solution)
     spread = sensitivity @ solution.covariance @ np.swapaxes(sensitivity, -1, -2)
     return float(np.sqrt(np.trace(covariance + spread, axis1=1, axis2=2).mean()))
+
+
+def _over_work_volume(result: Calibration, cell: Cell) -> bool:
+    return result.model is not None and cell.work_volume_mm is not None
+
+
+def _length_uncertainty(result: Calibration, cell: Cell, assembled: Assembled, solution: Solution) -> float | None:
+    """Expanded uncertainty (k = 2) of the least certain length over the work volume; without one, between sphere places."""
+    volume = cell.work_volume_box_mm
+    if volume is None or result.model is None:
+        return _longest_length_uncertainty(assembled, solution, result.covariance)
+    return volume_length_uncertainty_mm(result, volume)
 
 
 def _longest_length_uncertainty(assembled: Assembled, solution: Solution, covariance: FloatArray) -> float | None:

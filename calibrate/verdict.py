@@ -21,13 +21,15 @@ class Evidence:
     limits: Limits | None
     cross_validated_rms_mm: float
     length_expanded_uncertainty_mm: float | None
-    """k = 2, of a length between the two farthest sphere places; None with one place."""
+    """k = 2, of the least certain length over the work volume; where none is stated, between the farthest sphere places."""
     n_shots: int
     used: int
     has_joints: bool
     has_certified_length: bool
     line_profile: bool
     covariance_scale: float
+    over_work_volume: bool = False
+    """Whether the length is one of the work volume."""
     external_rms_mm: float | None = None
     """Rms of held-out external points; None without any."""
     shortcomings: tuple[str, ...] = ()
@@ -97,9 +99,8 @@ def _doubts(e: Evidence) -> list[str]:
     if e.limits is None:
         found.append("no limits given in the cell file: there is nothing to pass against")
     elif _unsure_length(e):
-        found.append(
-            f"a length between sphere places has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm"
-        )
+        where = "over the work volume" if e.over_work_volume else "between sphere places"
+        found.append(f"a length {where} has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm")
     if e.has_joints and not e.has_certified_length:
         found.append("no certified length was seen: the scale over the volume rests on sphere diameters and depth alone")
     if _MANY_REJECTED < 1 - e.used / max(e.n_shots, 1) <= _TOO_MANY_REJECTED:

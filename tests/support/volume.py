@@ -132,15 +132,15 @@ def observed(
     )
 
 
-def calibrated(volume: VolumeCell, shots: Observations, settings: CalibrationSettings | None = None) -> Calibration:
+def calibrated(volume: VolumeCell, shots: Observations, settings: CalibrationSettings | None = None, *, cell: Cell | None = None) -> Calibration:
     """The calibration of some shots, as `calibrate` makes it of a session that holds them."""
     settings = settings or CalibrationSettings()
     with one_thread():
-        solved, compared = solve_observations(shots, volume.cell, volume.model, settings)
+        solved, compared = solve_observations(shots, cell or volume.cell, volume.model, settings)
         return make_result(
             solved,
             method=settings.method,
-            cell=volume.cell,
+            cell=cell or volume.cell,
             sessions=[],
             n_shots=len(shots.shots),
             notes=(),
