@@ -30,6 +30,9 @@ _BUILT_IN: dict[str, dict[str, str]] = {
     CAMERA_GROUP: {"simulated": "drivers.simulated:make_camera", "recorded": "drivers.recorded:make_camera"},
 }
 
+NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket"})
+"""Drivers without a signed hardware log in docs/; every report says so."""
+
 
 @dataclass(frozen=True, slots=True)
 class DriverContext:

@@ -9,6 +9,7 @@ import numpy as np
 from acquire.cell import Cell
 from calibrate.result import Calibration, ShotResult
 from drivers.kinematics.se3 import FloatArray
+from drivers.registry import NEVER_ON_HARDWARE
 from measure.report_page import CalibrationFacts, ShotResidual
 
 _DATUM_TEXTS = {
@@ -55,6 +56,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         seen_cells=calibration.cells,
         identifiability=calibration.identifiability,
         error_budget=calibration.error_budget,
+        untried_drivers=() if cell is None else tuple(sorted({cell.robot.driver, cell.camera.driver} & NEVER_ON_HARDWARE)),
     )
 
 
@@ -102,6 +104,8 @@ def _identity(calibration: Calibration) -> Iterator[tuple[str, str]]:
     yield from _external(calibration)
     yield from _flat(calibration.identity, "")
     yield from ((f"input {key}", value) for key, value in _flat(calibration.inputs, ""))
+    for sensor, (coldest, warmest) in calibration.temperatures_c.items():
+        yield f"temperature {sensor}", f"{coldest:.1f}°C to {warmest:.1f}°C"
     if calibration.seen_joints_rad is not None:
         low, high = np.degrees(calibration.seen_joints_rad)
         yield "axis ranges used", ", ".join(f"{a:.0f}° to {b:.0f}°" for a, b in zip(low, high, strict=True))

@@ -61,6 +61,8 @@ class CalibrationFacts:
     """Where in the camera's view points were measured."""
     identifiability: Identifiability | None = None
     error_budget: ErrorBudget | None = None
+    untried_drivers: tuple[str, ...] = ()
+    """Drivers of the cell that have never run on hardware."""
 
 
 @dataclass(frozen=True, slots=True)

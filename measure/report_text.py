@@ -59,6 +59,7 @@ def remarks_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tu
     remarks = []
     if facts.simulated:
         remarks.append("Simulated cell: these figures come from a model of robot and camera, never from hardware.")
+    remarks += [f"The driver {name} has never run on hardware: no signed hardware log is in its documentation." for name in facts.untried_drivers]
     if verification is not None and not verification.held_out:
         remarks.append("Shots of the calibration itself were used for the verification: the figures flatter.")
     return tuple(remarks)

@@ -122,6 +122,8 @@ def test_a_calibration_alone_is_never_called_conform(calibration: Calibration, v
 
 def test_simulated_cells_and_training_data_are_remarked(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
     assert remarks_of(facts_of(calibration), verification) == ()
+    (untried,) = remarks_of(replace(facts_of(calibration), untried_drivers=("abb_socket",)), verification)
+    assert "abb_socket has never run on hardware" in untried
     simulated = replace(calibration, identity={"camera_serial": "simulated"})
     remarks = remarks_of(facts_of(simulated), replace(verification, held_out=False))
     assert "never from hardware" in remarks[0]
