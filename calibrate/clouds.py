@@ -107,6 +107,7 @@ def _descend(problem: Problem, state: State, noise: NoiseModel, n_estimates: int
         near = step_mm < _NEAR_MM
         curved = _sums_of_all(problem, state, geometry, sums, sums.curved_moments if near else sums.moments, rows, noise)
         step, noise_step = normal.solve_step(curved, normal.reduce(curved, noise.pose_precision))
+        step[problem.layout.terms] *= problem.free_terms  # the prior that holds the others leaves 1e-20 of them
         previous_mm, step_mm = step_mm, _size_mm(geometry, rows, step)
         if not estimating and _settled(step_mm, previous_mm, passes, tolerance_mm):
             linearised = _sums_of_all(problem, state, geometry, sums, sums.moments, rows, noise)
