@@ -15,12 +15,11 @@ import contextlib
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from drivers.errors import ChannelTaken, MotionRefused, RobotError, RobotNotReached, RobotTimeout, SettingsError, StaleReading
+from drivers.errors import ChannelTaken, MotionRefused, RobotError, RobotNotReached, RobotTimeout, StaleReading
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import CONNECT_S, SILENCE_S, RobotInfo, RobotState
@@ -32,19 +31,15 @@ from drivers.ur.link import Child
 from drivers.ur.net import Deadline, address_of
 from drivers.ur.preflight import preflight
 from drivers.ur.reading import check_can_move, failure_of, reason_of, state_of
+from drivers.ur.settings import UrSettings, ur_settings
+
+__all__ = ["UrRobot", "UrSettings", "make_robot"]
 
 log = logging.getLogger(__name__)
 
-SETTINGS = {
-    "host": "the controller's IP address or name",
-    "acceleration_rad_s2": "of the leading axis, above 0 to 10 (default 1.0)",
-    "frequency_hz": "how often it sends a reading, 50 to 500 (default 125)",
-    "upper_registers": "true: use registers 24 and up, where a fieldbus holds the lower ones (default false)",
-}
 _ARM_S = 0.5
 _CHILD_S = 1.2
 _CONTROL_S = 3.0
-_UPLOAD_SCRIPT, _UPPER_REGISTERS, _NO_FORCE_TORQUE = 0x01, 0x08, 0x40
 _FASTEST_RAD_S = 3.14
 _WATCHDOG_S, _LOOK_S = 2.3, 0.1
 _SCRIPTS = ("rtde_control", "unnamed")
@@ -54,21 +49,6 @@ _LARGEST_DEVIATION_MM, _SAME_MM = 20.0, 0.01
 _SLOWEST_SHARE, _RAMPS_S = 0.2, 6.0
 
 
-@dataclass(frozen=True, slots=True)
-class UrSettings:
-    """What a cell file says of a UR."""
-
-    host: str
-    acceleration_rad_s2: float = 1.0
-    frequency_hz: float = 125.0
-    upper_registers: bool = False
-
-    @property
-    def flags(self) -> int:
-        """For ur_rtde's control client; the external force input is not ours to claim."""
-        return _UPLOAD_SCRIPT | _NO_FORCE_TORQUE | (_UPPER_REGISTERS if self.upper_registers else 0)
-
-
 def make_robot(context: DriverContext) -> UrRobot:
     """The UR of a cell file.
 
@@ -76,27 +56,6 @@ def make_robot(context: DriverContext) -> UrRobot:
         SettingsError: `host` is missing, or another key or value is not allowed.
     """
     return UrRobot(ur_settings(context.settings), context.robot_model)
-
-
-def ur_settings(settings: Mapping[str, object]) -> UrSettings:
-    """The settings, checked.
-
-    Raises:
-        SettingsError: as `make_robot`.
-    """
-    for key in settings:
-        if key not in SETTINGS:
-            raise SettingsError(f"unknown key {key!r}", where="robot (driver ur_rtde)", remedy=f"Allowed: {', '.join(SETTINGS)}.")
-    host = settings.get("host")
-    if not isinstance(host, str) or not host:
-        remedy = "Add `host: 192.168.0.10` to the cell file."
-        raise SettingsError("the controller's address is missing", where="robot (driver ur_rtde)", remedy=remedy)
-    return UrSettings(
-        host,
-        acceleration_rad_s2=_number(settings, "acceleration_rad_s2", 1.0, 1e-3, 10.0),
-        frequency_hz=_number(settings, "frequency_hz", 125.0, 50.0, 500.0),
-        upper_registers=_flag(settings, "upper_registers"),
-    )
 
 
 class UrRobot:
@@ -309,17 +268,3 @@ class UrRobot:
         if self._arm is None or self._arm.flange_from_tcp is None:
             notes.append("the active tool could not be read, so there is no flange pose")
         return tuple(notes)
-
-
-def _number(settings: Mapping[str, object], key: str, default: float, low: float, high: float) -> float:
-    value = settings.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise SettingsError(f"{value!r} is not allowed", where=f"robot.{key}", remedy=f"{key}: {SETTINGS[key]}.")
-    return float(value)
-
-
-def _flag(settings: Mapping[str, object], key: str) -> bool:
-    value = settings.get(key, False)
-    if not isinstance(value, bool):
-        raise SettingsError(f"{value!r} is not allowed", where=f"robot.{key}", remedy=f"{key}: {SETTINGS[key]}.")
-    return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -83,6 +84,7 @@ def _afterwards(action: Callable[[], object]) -> None:
 
 
 def _quit_at_eof(bench: BenchClient) -> None:
-    while sys.stdin.buffer.read(4096):
+    # not sys.stdin: its lock would be held when the interpreter shuts down
+    while os.read(sys.stdin.fileno(), 4096):
         pass
     bench.ask("quit")

@@ -15,7 +15,8 @@ from acquire.cell import Cell, devices_of, robot_model_of
 from drivers.errors import SpherecalError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
-from drivers.protocols import Camera3D, Frame3D, Robot, RobotState
+from drivers.models import load_robot_model, shipped_models
+from drivers.protocols import Camera3D, Frame3D, Mode, Robot, RobotState
 
 Facts: TypeAlias = dict[str, object]
 
@@ -112,8 +113,26 @@ def examine_robot(robot: Robot, model: RobotModel | None, diagnosis: Diagnosis) 
         mode=state.mode,
         safety=state.safety.value,
         moving=state.moving,
+        motors_on=state.motors_on,
+        active_tool=state.active_tool,
+        active_work_object=state.active_work_object,
+        age_s=state.age_s,
+        notes=list(info.notes),
     )
     diagnosis.problems.extend(f"robot: {problem}" for problem in problems)
+    diagnosis.hints.extend(f"robot: {hint}" for hint in (*info.notes, *robot_hints(state)))
+
+
+def robot_hints(state: RobotState) -> list[str]:
+    """What would keep a healthy robot from moving, or is worth knowing of it."""
+    hints = []
+    if state.motors_on is False:
+        hints.append("the motors are off, so motions will be refused. Switch them on at the pendant")
+    if state.mode in (Mode.LOCAL, Mode.MANUAL):
+        hints.append(f"it is in {state.mode} mode, so motions will be refused; hand guiding works")
+    if state.active_tool not in (None, "tool0"):
+        hints.append(f"the active tool is {state.active_tool}; axis angles do not depend on it")
+    return hints
 
 
 def robot_problems(state: RobotState, model: RobotModel | None) -> list[str]:
@@ -131,17 +150,39 @@ def robot_problems(state: RobotState, model: RobotModel | None) -> list[str]:
     if not bool(mdh.within_limits(model, state.joints_rad)):
         problems.append(f"stands outside the axis limits of {model.name}. Wrong model, or degrees for radians?")
     if state.base_from_flange is not None:
-        problems.extend(_pose_problems(state.base_from_flange, mdh.base_from_flange(model, state.joints_rad)))
+        problems.extend(_pose_problems(state.base_from_flange, state.joints_rad, model))
     return problems
 
 
-def _pose_problems(reported: se3.FloatArray, nominal: se3.FloatArray) -> list[str]:
-    off = se3.log(se3.inverse(nominal) @ reported)
-    off_mm, off_rad = float(np.linalg.norm(reported[:3, 3] - nominal[:3, 3])), float(np.linalg.norm(off[3:]))
-    if off_mm <= FACTORY_CALIBRATED_MM and off_rad <= FACTORY_CALIBRATED_RAD:
+def _pose_problems(reported: se3.FloatArray, joints_rad: se3.FloatArray, model: RobotModel) -> list[str]:
+    off_mm, off_rad = _apart(reported, mdh.base_from_flange(model, joints_rad))
+    if _fits(reported, joints_rad, model):
         return []
-    causes = "wrong model, axis order or coupling, or a tool or work object that is active"
+    causes = _likely_cause(reported, joints_rad, model)
     return [f"its flange pose is {off_mm:.1f} mm and {np.degrees(off_rad):.2f} degrees from the model's: {causes}"]
+
+
+def _likely_cause(reported: se3.FloatArray, joints_rad: se3.FloatArray, model: RobotModel) -> str:
+    in_mm = reported.copy()
+    in_mm[:3, 3] *= 1000
+    if _fits(in_mm, joints_rad, model):
+        return "it is in metres. The adapter must convert it to mm"
+    for name in shipped_models():
+        other = load_robot_model(name)
+        if other.n_joints == joints_rad.size and _fits(reported, joints_rad, other):
+            return f"another model. It fits {name}: set `model: {name}` in the cell file"
+    return "wrong model, axis order or coupling, or a tool or work object that is active. Compare model, tool and work object with the pendant"
+
+
+def _fits(reported: se3.FloatArray, joints_rad: se3.FloatArray, model: RobotModel) -> bool:
+    off_mm, off_rad = _apart(reported, mdh.base_from_flange(model, joints_rad))
+    return off_mm <= FACTORY_CALIBRATED_MM and off_rad <= FACTORY_CALIBRATED_RAD
+
+
+def _apart(first: se3.FloatArray, second: se3.FloatArray) -> tuple[float, float]:
+    """Distance in mm and angle in rad of two flange poses (4, 4)."""
+    turn = se3.log_so3(first[:3, :3].T @ second[:3, :3])
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3])), float(np.linalg.norm(turn))
 
 
 def examine_camera(camera: Camera3D, cell: Cell, diagnosis: Diagnosis) -> None:

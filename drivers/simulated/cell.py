@@ -113,14 +113,18 @@ class SimulatedCell:
         self._folder, self._instant, self._run = folder or Path(), instant, run
         self._clock_s = clock_start_s
         self._real_start_s = time.monotonic()
-        home = _home(truth, model)
-        self._motion = Motion(home, home, clock_start_s, 0.0, 0.0)
-        self._approach = np.zeros(model.n_joints)
+        self._mesh: Mesh | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Put the axes where they stood at first, as if the robot had never moved; the clock goes on."""
+        home = _home(self.truth, self.model)
+        self._motion = Motion(home, home, self.clock_s, 0.0, 0.0)
+        self._approach = np.zeros(self.model.n_joints)
         self._n_motions = 0
         self._n_readings = 0
         self._asked = home
-        self._noise: StopNoise = no_noise(model)
-        self._mesh: Mesh | None = None
+        self._noise: StopNoise = no_noise(self.model)
 
     @property
     def clock_s(self) -> float:

@@ -56,11 +56,13 @@ def preflight(host: str, deadline: Deadline, *, port: int = RTDE_PORT) -> Versio
 
 def _asked(link: socket.socket, stream: wire.RtdeStream, kind: int, payload: bytes, deadline: Deadline) -> bytes:
     send(link, wire.package(kind, payload), deadline)
+    data = b""  # what came with the answer before
     for _ in range(_MOST_PACKAGES):
-        for found, content in stream.feed(receive(link, deadline)):
+        for found, content in stream.feed(data):
             if found == kind:
                 return content
             if found != wire.TEXT_MESSAGE:
                 msg = f"package type {found} instead of {kind}"
                 raise wire.WireError(msg)
+        data = receive(link, deadline)
     raise RobotTimeout("sends much and answers nothing", remedy="Is this the address of a UR controller?")

@@ -139,6 +139,7 @@ class Machine:
         """A new program takes the place of whatever ran."""
         self.end_program()
         self.program = program
+        self.messages.append(f"program {program.name} begins")
 
     def end_program(self) -> None:
         """Stop the program, and the motion that it makes."""

@@ -15,6 +15,7 @@ from drivers.simulated.controllers.ur.server import UrController
 from drivers.simulated.truth import RobotTruth, Truth
 
 HOME_RAD = (0.0, -1.57, 1.2, -1.2, -1.57, 0.0)
+_TWISTS_RAD = np.pi / 2 * np.array([0, 1, 0, 0, 1, 1])
 _CALIBRATION_MM, _CALIBRATION_RAD = 0.2, 3e-4
 
 
@@ -44,7 +45,7 @@ def make_controller(
     """
     if not host.startswith("127."):
         raise SettingsError(f"{host} is no loopback address", where="--host", remedy="Simulated controllers serve 127.0.0.1 to 127.255.255.254 only.")
-    if model.n_joints != 6 or model.a_mm[0] or model.alpha_rad[0]:
+    if model.n_joints != 6 or model.a_mm[0] or not np.allclose(np.abs(model.alpha_rad), _TWISTS_RAD, atol=0.05):
         raise SettingsError(f"{model.name} is no UR", where="--model", remedy="Name ur5e, ur10e, or a model file of a UR.")
     truth = truth or Truth(robot=RobotTruth(home_rad=HOME_RAD))
     if not truth.robot.home_rad:

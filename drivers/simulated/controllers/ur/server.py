@@ -11,139 +11,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 from collections.abc import Callable
 from concurrent.futures import Future
 
 from drivers.errors import SettingsError
 from drivers.simulated.controllers.bench import BenchServer, axes_text
 from drivers.simulated.controllers.holes import BlackHole
-from drivers.simulated.controllers.ur import dashboard, primary
+from drivers.simulated.controllers.ur import primary
+from drivers.simulated.controllers.ur.connections import Connection, DashboardConnection, PrimaryConnection, RtdeConnection, ScriptConnection
 from drivers.simulated.controllers.ur.faults import BUTTONS, WIRE_FAULTS, LineState, press
 from drivers.simulated.controllers.ur.machine import Machine, RobotMode
-from drivers.simulated.controllers.ur.program import program_of
-from drivers.simulated.controllers.ur.rtde import RtdeSession
-from drivers.ur.wire import WireError
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORTS = 30004, 29999, 30003, (30001, 30002)
 _SLOWEST_CYCLE_S, _PRIMARY_PERIOD_S = 0.008, 0.1
-_DROP_AFTER_S, _BETWEEN_PIECES_S = 0.1, 0.002
-_MOST_UNREAD = 1 << 16
-_LONGEST_SCRIPT = 1 << 20
+_DROP_AFTER_S = 0.1
 _BENCH_TIMEOUT_S = 5.0
-
-
-class _Connection(asyncio.Protocol):
-    """One client at one port."""
-
-    def __init__(self, controller: UrController) -> None:
-        self.controller = controller
-        self.transport: asyncio.Transport | None = None
-        self._rest = b""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if isinstance(transport, asyncio.Transport):
-            self.transport = transport
-            self.controller.connections.add(self)
-            self.begin()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        del exc
-        self.controller.connections.discard(self)
-
-    def begin(self) -> None:
-        """The client is there."""
-
-    def answer(self, data: bytes) -> None:
-        """Send bytes as fast, late or incomplete as the line is now."""
-        line = self.controller.line
-        if self.transport is None or self.transport.is_closing() or line.silent:
-            return
-        if self.transport.get_write_buffer_size() > _MOST_UNREAD:
-            return
-        late_s = max(line.lag_s, line.slow_s)
-        if late_s > 0:
-            asyncio.get_running_loop().call_later(late_s, self._write, data)
-        elif self._rest:
-            self._rest += data
-        elif line.fragments and len(data) > 1:
-            self._rest = data[len(data) // 2 :]
-            self._write(data[: len(data) // 2])
-            asyncio.get_running_loop().call_later(_BETWEEN_PIECES_S, self._write_rest)
-        else:
-            self._write(data)
-
-    def _write_rest(self) -> None:
-        rest, self._rest = self._rest, b""
-        self._write(rest)
-
-    def _write(self, data: bytes) -> None:
-        if self.transport is not None and not self.transport.is_closing():
-            self.transport.write(data)
-
-
-class _Rtde(_Connection):
-    def begin(self) -> None:
-        self.session = RtdeSession(self.controller.machine, self.answer, self.controller.claimed)
-
-    def data_received(self, data: bytes) -> None:
-        try:
-            self.session.receive(data)
-        except WireError:
-            self.drop()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        self.session.release()
-
-    def drop(self) -> None:
-        if self.transport is not None:
-            self.transport.abort()
-
-    def send_data(self, now_s: float) -> None:
-        """A data package, when one is due."""
-        line = self.controller.line
-        if not self.session.started or now_s < self.session.due_s:
-            return
-        self.session.due_s = max(self.session.due_s + self.session.period_s, now_s - self.session.period_s) + line.slow_s
-        self.session.frozen_s = (self.session.frozen_s or self.controller.machine.timestamp_s) if line.stale else None
-        data = self.session.data()
-        self.answer(data[: len(data) // 2] if line.half else data)
-
-
-class _Dashboard(_Connection):
-    def begin(self) -> None:
-        self.buffer = b""
-        self.answer(dashboard.GREETING.encode() + b"\n")
-
-    def data_received(self, data: bytes) -> None:
-        *lines, self.buffer = (self.buffer + data).split(b"\n")
-        for line in lines:
-            if self.controller.line.silent:
-                return
-            reply = dashboard.answer(self.controller.machine, line.decode("utf-8", "replace"))
-            self.answer(reply.encode() + b"\n")
-            if reply == dashboard.GOODBYE and self.transport is not None:
-                self.transport.close()
-
-
-class _Script(_Connection):
-    def begin(self) -> None:
-        self.text = ""
-
-    def data_received(self, data: bytes) -> None:
-        self.text = (self.text + data.decode("utf-8", "replace"))[-_LONGEST_SCRIPT:]
-        while (match := re.search(r"^end[ \t]*\r?\n", self.text, re.MULTILINE)) is not None:
-            program, self.text = self.text[: match.end()], self.text[match.end() :]
-            machine = self.controller.machine
-            if not self.controller.line.silent and machine.can_move:
-                machine.run(program_of(program, machine))
-
-
-class _Primary(_Script):
-    def begin(self) -> None:
-        super().begin()
-        self.answer(primary.version_message())
 
 
 class UrController:
@@ -158,11 +40,11 @@ class UrController:
     def __init__(self, machine: Machine, host: str, *, bench_port: int) -> None:
         self.machine, self.host = machine, host
         self.line = LineState()
-        self.connections: set[_Connection] = set()
+        self.connections: set[Connection] = set()
         self.claimed: dict[str, object] = {}
         self._servers: list[asyncio.Server] = []
         self._holes: list[BlackHole] = []
-        self._bench = BenchServer(host, bench_port, self._ask)
+        self._bench_port = bench_port
         self._loop: asyncio.AbstractEventLoop | None = None
         self._quit = asyncio.Event()
         self._returns: asyncio.TimerHandle | None = None
@@ -170,8 +52,8 @@ class UrController:
 
     @property
     def bench_port(self) -> int:
-        """Port of the bench."""
-        return self._bench.port
+        """Port of the bench, the real one once the controller serves."""
+        return self._bench_port
 
     async def run(self, tell: Callable[[str], None]) -> None:
         """Serve; `tell` is given one line when the ports are open.
@@ -180,18 +62,24 @@ class UrController:
             SettingsError: a port is taken.
         """
         self._loop = asyncio.get_running_loop()
-        cycles = None
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._vanish)
             await self._listen()
-            self._bench.start()
-            tell(f"simulated UR controller at {self.host}, bench at {self.host}:{self._bench.port}")
+            bench = self._open_bench()
+            stack.callback(bench.close)
             cycles = asyncio.create_task(self._cycles())
+            stack.callback(cycles.cancel)
+            tell(f"simulated UR controller at {self.host}, bench at {self.host}:{self._bench_port}")
             await self._quit.wait()
-        finally:
-            if cycles is not None:
-                cycles.cancel()
-                self._bench.close()
-            self._vanish()
+
+    def _open_bench(self) -> BenchServer:
+        try:
+            bench = BenchServer(self.host, self._bench_port, self._ask)
+        except OSError as error:
+            raise _taken(self._bench_port, self.host, error) from error
+        self._bench_port = bench.port
+        bench.start()
+        return bench
 
     def stop(self) -> None:
         """Let `run` end."""
@@ -199,13 +87,13 @@ class UrController:
 
     async def _listen(self) -> None:
         loop = asyncio.get_running_loop()
-        ports: list[tuple[int, type[_Connection]]] = [(RTDE_PORT, _Rtde), (DASHBOARD_PORT, _Dashboard), (SCRIPT_PORT, _Script)]
-        for port, kind in [*ports, *((port, _Primary) for port in PRIMARY_PORTS)]:
+        kinds = {RTDE_PORT: RtdeConnection, DASHBOARD_PORT: DashboardConnection, SCRIPT_PORT: ScriptConnection}
+        for port in (*kinds, *PRIMARY_PORTS):
+            kind = kinds.get(port, PrimaryConnection)
             try:
                 self._servers.append(await loop.create_server(lambda kind=kind: kind(self), self.host, port))  # type: ignore[misc]
             except OSError as error:
-                remedy = "Choose another loopback address with --host, e.g. 127.0.0.3."
-                raise SettingsError(f"port {port} of {self.host} cannot be opened ({error.strerror})", where="--host", remedy=remedy) from error
+                raise _taken(port, self.host, error) from error
 
     def _vanish(self) -> None:
         """No listener, no connection."""
@@ -228,9 +116,9 @@ class UrController:
             last_s = now_s
             self._drop_at_motion()
             for connection in list(self.connections):
-                if isinstance(connection, _Rtde):
+                if isinstance(connection, RtdeConnection):
                     connection.send_data(now_s)
-                elif isinstance(connection, _Primary) and now_s - primary_s >= _PRIMARY_PERIOD_S:
+                elif isinstance(connection, PrimaryConnection) and now_s - primary_s >= _PRIMARY_PERIOD_S:
                     connection.answer(primary.robot_state(self.machine))
             if now_s - primary_s >= _PRIMARY_PERIOD_S:
                 primary_s = now_s
@@ -238,7 +126,7 @@ class UrController:
                 self.line.half, self.line.silent = False, True
 
     def _period_s(self) -> float:
-        periods = [c.session.period_s for c in self.connections if isinstance(c, _Rtde) and c.session.started]
+        periods = [c.session.period_s for c in self.connections if isinstance(c, RtdeConnection) and c.session.started]
         return min([*periods, _SLOWEST_CYCLE_S])
 
     def _drop_at_motion(self) -> None:
@@ -252,9 +140,9 @@ class UrController:
                 self._drop()
         self._n_motions = count
 
-    def _drop(self) -> None:
+    def _drop(self, *, commanding_only: bool = False) -> None:
         for connection in list(self.connections):
-            if isinstance(connection, _Rtde):
+            if isinstance(connection, RtdeConnection) and not (commanding_only and connection.session not in self.claimed.values()):
                 connection.drop()
 
     def _ask(self, line: str) -> str:
@@ -275,12 +163,15 @@ class UrController:
                 return "; ".join(self.machine.messages)
             case ["clear"]:
                 await self._clear()
+            case ["home"]:
+                self.machine.end_program()
+                self.machine.cell.reset()
             case ["quit"]:
                 asyncio.get_running_loop().call_soon(self.stop)
             case ["fault", name, *rest]:
                 await self._fault(name, [float(word) for word in rest])
             case _:
-                msg = "axes, faults, fault NAME [NUMBERS], clear, log or quit"
+                msg = "axes, faults, fault NAME [NUMBERS], clear, home, log or quit"
                 raise ValueError(msg)
         return ""
 
@@ -305,8 +196,8 @@ class UrController:
                 await self._swallow()
             case "silence" | "half_packets" | "fragments" | "stale":
                 setattr(line, {"silence": "silent", "half_packets": "half"}.get(name, name), True)
-            case "drop":
-                self._drop()
+            case "drop" | "drop_commanding":
+                self._drop(commanding_only=name == "drop_commanding")
             case "drop_mid_move" | "drop_at_command":
                 line.drop_after_s = _DROP_AFTER_S if name == "drop_mid_move" else 0.0
             case "slow":
@@ -343,6 +234,11 @@ class UrController:
             task.add_done_callback(lambda done: None if done.cancelled() else done.exception())
 
         self._returns = asyncio.get_running_loop().call_later(seconds, back)
+
+
+def _taken(port: int, host: str, error: OSError) -> SettingsError:
+    remedy = "Choose another loopback address with --host, e.g. 127.0.0.3."
+    return SettingsError(f"port {port} of {host} cannot be opened ({error.strerror})", where="--host", remedy=remedy)
 
 
 def serve(controller: UrController, tell: Callable[[str], None]) -> None:
