@@ -23,6 +23,9 @@ from drivers.registry import make_devices
 
 CELL_FORMAT = "spherecal-cell/1"
 _SMALLEST_DIAMETER_MM = 1.0
+Expansion = Annotated[float, Field(gt=-1e-4, lt=1e-3)]
+"""Per kelvin. Steel is 11.5e-6: the bounds catch a forgotten 1e-6."""
+Celsius = Annotated[float, Field(gt=-100, lt=100)]
 
 
 class _Device(StrictModel):
@@ -73,8 +76,9 @@ class Sphere(StrictModel):
     centre_in_base_mm: Vector3 | None = None
     certificate: str | None = None
     form_mm: NotNegative | None = None
-    cte_per_k: float | None = None
-    reference_temperature_c: float | None = None
+    cte_per_k: Expansion | None = None
+    reference_temperature_c: Celsius | None = None
+    """Where the diameter holds; 20 degrees C where it is not told."""
 
     @field_validator("diameter_mm")
     @classmethod
@@ -100,6 +104,9 @@ class CertifiedLength(StrictModel):
     length_mm: Positive
     expanded_uncertainty_mm: Positive
     """k = 2."""
+    cte_per_k: Expansion | None = None
+    """Without it the length is taken as it is, whatever the temperature."""
+    reference_temperature_c: Celsius = 20.0
 
     @property
     def standard_uncertainty_mm(self) -> float:

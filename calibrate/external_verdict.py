@@ -19,6 +19,7 @@ from calibrate.normal import symmetric_inverse
 from calibrate.observations import RejectedShot
 from calibrate.result import Calibration, Statistics
 from calibrate.result_file import calibration_data
+from calibrate.temperature import temperature_ranges_c
 from drivers.errors import DataError
 from drivers.files.session import Session
 from drivers.kinematics.mdh import RobotModel
@@ -129,6 +130,7 @@ def robot_alone_result(
         identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
         created_utc=created_utc,
         software=software,
+        temperatures_c=temperature_ranges_c(sessions),
         hand_eye="none" if cell.flange_from_camera is None else "cell",
         external=external_result(problem, state, datum, covariance, solved.held_out_mm, predicted, solved.compared),
     )

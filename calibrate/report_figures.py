@@ -30,6 +30,7 @@ from calibrate.problem import Problem
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.sources import artefact_covariance
+from calibrate.temperature import temperature_ranges_c
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2
 from calibrate.verdict import Evidence, judge, wants_more_poses
 from calibrate.volume_lengths import volume_length_uncertainty_mm
@@ -118,6 +119,7 @@ def make_result(
         identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
         created_utc=created_utc,
         software=software,
+        temperatures_c=temperature_ranges_c(sessions),
         external=external_result(problem, state, datum, covariance, solved.external_held_out_mm, external_predicted),
         identifiability=identifiability,
         seen_cells=seen_cells(problem.points_in_camera_mm) if len(problem.points_in_camera_mm) else None,

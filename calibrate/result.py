@@ -126,6 +126,8 @@ class Calibration:
     """Frames and targets of external reference points; None where none was seen."""
     identifiability: Identifiability | None = None
     """What the shots determined and what not; None in files of older versions."""
+    temperatures_c: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Least and greatest reading of every sensor while the shots were taken."""
     next_best_poses: tuple[PlannedPose, ...] = ()
     """Poses that would tell most next, best first, where the verdict asks for more."""
     seen_cells: SeenCells | None = None

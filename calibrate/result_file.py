@@ -73,6 +73,7 @@ def calibration_data(c: Calibration) -> dict[str, object]:
         },
         "datum": {"kind": c.datum.kind, "base_from_solver": c.datum.base_from_solver, "reference_joints_rad": _rows(c.datum.reference_joints_rad)},
         "seen_axis_ranges_rad": c.seen_joints_rad,
+        "temperatures_c": dict(c.temperatures_c),
         "noise": asdict(c.noise),
         "statistics": {key: value for key, value in asdict(c.statistics).items() if key != "seconds"},
         "identifiability": None if c.identifiability is None else c.identifiability.to_json_dict(),
@@ -168,6 +169,7 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         hand_eye=_hand_eye(data.get("hand_eye", "calibrated")),
         external=None if data.get("external") is None else external_from_data(_mapping(data["external"])),
         # sections that files of older versions lack
+        temperatures_c={name: _pair(seen) for name, seen in _mapping(data.get("temperatures_c", {})).items()},
         identifiability=None if data.get("identifiability") is None else Identifiability.from_json_dict(_mapping(data["identifiability"])),
         next_best_poses=tuple(_pose(_mapping(pose)) for pose in _sequence(data.get("next_best_poses", []))),
         seen_cells=seen_cells_from_data(camera["seen_cells"], _array(camera["seen_volume_mm"])) if "seen_cells" in camera else None,
@@ -254,6 +256,11 @@ def _rigid(value: object, file: str, where: str) -> FloatArray:
     if not se3.is_rigid(transform):
         raise FileError("is no rigid transform", file=file, where=where, remedy="Calibrate again to write a whole file.")
     return transform
+
+
+def _pair(value: object) -> tuple[float, float]:
+    low, high = _array(value)
+    return float(low), float(high)
 
 
 def _mapping(value: object) -> dict[str, object]:

@@ -35,6 +35,7 @@ from calibrate.result import Calibration
 from calibrate.second_look import see_sessions
 from calibrate.start import start_from_centres
 from calibrate.start_arcs import start_from_arcs
+from calibrate.temperature import cell_when_seen
 from calibrate.term_choice import NO_CHOICE, choose_terms, with_terms
 from calibrate.validation import Prediction, cross_validate
 from drivers.errors import DataError, SettingsError
@@ -104,7 +105,8 @@ def calibrate(sessions: Sequence[Session], settings: CalibrationSettings | None 
 def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Calibration:
     began = time.perf_counter()
     cell, model = cell_of_sessions(sessions)
-    notes = check_reported_poses(sessions, model)
+    cell, warmth = cell_when_seen(cell, sessions)
+    notes = check_reported_poses(sessions, model) + warmth
     observations = see_sessions(sessions, cell=cell, model=model)
     if model is not None and observations.external and not _show_spheres(sessions):
         return _calibrate_robot_alone(sessions, observations, cell, model, settings, notes, began)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -60,6 +60,11 @@ class JudgedSystem(MeasuringSystem, Protocol):
     @property
     def limits(self) -> Limits | None:
         """Limits of the cell it was made in."""
+        ...
+
+    @property
+    def temperatures_c(self) -> Mapping[str, tuple[float, float]]:
+        """Least and greatest reading of every sensor while it was made."""
         ...
 
     @property

@@ -20,6 +20,7 @@ from acquire.cell import Cell, CertifiedLength, Limits, Sphere, cell_of_session,
 from calibrate.normal import NoiseModel
 from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.second_look import see_sessions
+from calibrate.temperature import artefact_when_seen, temperature_changes
 from drivers.errors import DataError
 from drivers.files.session import Session
 from drivers.kinematics import se3
@@ -69,7 +70,8 @@ def verify(
     if trained and not allow_training_data:
         raise _flattering(trained)
     observations = _gather(sessions, cells)
-    spheres, lengths = _merged(cells)
+    artefact = artefact_when_seen(*_merged(cells), sessions)
+    spheres, lengths = artefact.spheres, artefact.lengths
     limits = limits or next((c.limits for c in cells if c.limits is not None), None) or calibration.limits
     line_profile = cells[0].camera.kind == "line_profile"
     sizes = {name: SphereSize(s.radius_mm, calibration.radius_offset_mm) for name, s in spheres.items()}
@@ -91,7 +93,7 @@ def verify(
         limits=limits,
         judgements=judgements,
         verdict=verdict,
-        reasons=reasons,
+        reasons=(*reasons, *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
         held_out=not trained,
         seconds=time.perf_counter() - began,
     )

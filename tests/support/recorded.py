@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,7 @@ class TrueSystem:
     sigma_of_scale: float = 3e-5
     sigma_of_radius_mm: float = 0.0
     noise: NoiseModel = NEXT_TO_NO_NOISE
+    temperatures_c: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def model(self) -> RobotModel | None:

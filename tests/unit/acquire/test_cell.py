@@ -83,6 +83,13 @@ def test_a_full_cell(tmp_path: Path) -> None:
     assert cell.data == FULL.encode()
 
 
+def test_certificates_hold_at_20_degrees_unless_they_say_otherwise(tmp_path: Path) -> None:
+    plain = _load(tmp_path, FULL)
+    assert (plain.lengths[0].cte_per_k, plain.lengths[0].reference_temperature_c) == (None, 20.0)
+    told = _load(tmp_path, FULL.replace("0.003}]", "0.003, cte_per_k: 1.15e-5, reference_temperature_c: 23}]"))
+    assert (told.lengths[0].cte_per_k, told.lengths[0].reference_temperature_c) == (1.15e-5, 23.0)
+
+
 def test_the_least_cell_has_the_defaults(tmp_path: Path) -> None:
     cell = _load(tmp_path, MINIMAL)
     assert (cell.lengths, cell.limits, cell.work_volume_mm, cell.obstacles, cell.flange_from_camera) == ((), None, None, (), None)
@@ -118,6 +125,9 @@ WRONG = {
     "number as a name": ("  B:", "  2:", "spheres.2", "quotes"),
     "length to nowhere": ("[A, B]", "[A, C]", "lengths.0", "'C'"),
     "length to itself": ("[A, B]", "[A, A]", "lengths.0", "twice"),
+    "expansion in millionths": ("5.5e-6", "5.5", "spheres.A.cte_per_k", "less than 0.001"),
+    "expansion of a length": ("0.003}]", "0.003, cte_per_k: 11.5}]", "lengths.0.cte_per_k", "less than 0.001"),
+    "reference in kelvin": ("0.003}]", "0.003, reference_temperature_c: 293.15}]", "lengths.0.reference_temperature_c", "less than 100"),
     "length without uncertainty": ("500.012, expanded_uncertainty_mm: 0.003", "500.012, expanded_uncertainty_mm: 0", "lengths.0", "greater than 0"),
     "limit of nothing": ("centre_rms_mm: 0.2", "centre_rms_mm: 0", "limits.centre_rms_mm", "greater than 0"),
     "stretched hand-eye": ("[0, 0, 1, 85]", "[0, 0, 1.001, 85]", "flange_from_camera", "rigid"),
