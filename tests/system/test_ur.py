@@ -8,8 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from acquire.cell import load_cell, robot_model_of
+from acquire.events import Captured, Event
+from acquire.plan import load_plan
 from calibrate import Calibration
+from drivers.errors import LinkLost, RobotTimeout
 from drivers.files.session import read_scan, read_session
+from measure.running import capture_session
 from tests.support.fake_ur import FakeUr, fake_ur, own_address
 from tests.support.ur_cell import write_cells
 from tests.system.conftest import Cli
@@ -65,8 +70,6 @@ def test_the_whole_way_gives_what_the_plain_simulated_robot_gives(cells: tuple[P
 
 
 def _digest(cell: Path) -> str:
-    from acquire.cell import load_cell
-
     return load_cell(cell).sha256
 
 
@@ -79,3 +82,25 @@ def _assert_same_session(wired: Path, plain: Path) -> None:
         assert other.joints_rad is not None
         np.testing.assert_allclose(shot.joints_rad, other.joints_rad, atol=1e-12)
         np.testing.assert_array_equal(read_scan(ours, shot).xyz_mm, read_scan(theirs, other).xyz_mm)
+
+
+def test_a_run_whose_link_was_cut_is_gone_on_with(cells: tuple[Path, Path], controller: FakeUr, tmp_path: Path, cli: Cli) -> None:
+    """Cut in mid-move after the first shot: the run ends in LinkLost, and `--resume` takes the poses that are left."""
+    _, wired = cells
+    plan, out = tmp_path / "plan.yaml", tmp_path / "session"
+    assert cli("plan", wired, "--for", "verify", "-n", 3, "--sphere", "G", "-o", plan, "-q").code == 0
+    loaded = load_cell(wired)
+    poses = load_plan(plan, loaded, robot_model_of(loaded))
+
+    def cut(event: Event) -> None:
+        if isinstance(event, Captured):
+            controller.fault("drop_at_command")
+
+    with pytest.raises((LinkLost, RobotTimeout)):
+        capture_session(loaded, poses, out, watcher=cut)
+    controller.clear()
+    before = controller.n_motions()
+    assert len(read_session(out).shots) == 1
+    told = cli("capture", wired, plan, "-o", out, "--yes", "--resume", "--json").told
+    assert (told["n_shots"], told["state"]) == (3, "complete")
+    assert controller.n_motions() >= before + 2
