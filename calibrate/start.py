@@ -18,7 +18,8 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _ROUNDS = 30
-_STILL_MM = 1e-7
+_STILL_MM = 1e-5
+_SURELY_MM, _MANY_SHOTS = 0.3, 30
 _SMALLEST_SCALE_MM = 0.05
 _REJECT_SCALES = 8.0
 _REJECT_AT_LEAST_MM = 1.0
@@ -44,7 +45,8 @@ class Start:
 def start_from_centres(problem: Problem, centres_in_camera_mm: FloatArray, guess: FloatArray | None) -> Start:
     """Start for shots with a centre (m, 3) each; `guess` is a flange_from_camera (4, 4) or None.
 
-    The guess and the linear solution are both refined, and the one that explains the shots better is taken.
+    The guess and the linear solution are both refined, and the one that explains the shots better is taken; the second is
+    not looked at where the first leaves next to nothing of many shots.
 
     Raises:
         DataError: neither brings most shots within some centimetres of one place: the data do not belong together.
@@ -55,8 +57,9 @@ def start_from_centres(problem: Problem, centres_in_camera_mm: FloatArray, guess
         hand_eyes.append(linear)
     if not hand_eyes:
         raise DataError("too few shots for a first guess of the hand-eye transform", remedy="Take at least 12 shots from different orientations.")
-    starts = [_refine(problem, centres_in_camera_mm, hand_eye) for hand_eye in hand_eyes]
-    best = min(starts, key=lambda s: s.scale_mm)
+    best = _refine(problem, centres_in_camera_mm, hand_eyes[0])
+    if len(hand_eyes) > 1 and not (best.scale_mm < _SURELY_MM and problem.n_shots >= _MANY_SHOTS):
+        best = min(best, _refine(problem, centres_in_camera_mm, hand_eyes[1]), key=lambda s: s.scale_mm)
     if not best.scale_mm < _FITS_MM:
         raise DataError(
             f"no hand-eye transform brings the shots of a sphere to one place (they stay {best.scale_mm:.0f} mm apart)",
