@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from calibrate.camera_error import CameraError, NoCameraError, PillowError, PolynomialError
 from calibrate.normal import NoiseModel
 from calibrate.polynomials import Polynomials, monomials
-from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
+from calibrate.problem import Geometry, Problem, State, linearise_geometry
 from calibrate.sums import POINT_CUTOFF_SIGMAS, patch_sums, shot_moments, shot_sums
 from drivers.kinematics.se3 import FloatArray
 from tests.support.solving import cosines, draw_shots, noise_free, point_rows, problem_of, start_of
