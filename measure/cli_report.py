@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from calibrate import Calibration
     from drivers.files.session import Session
 
+_SCANS = "Name a session with scans of spheres or of a workpiece; `spherecal report` makes a page of any calibration."
 AnySessions = Annotated[list[Path] | None, typer.Argument(help="Session folders.")]
 
 
@@ -88,7 +89,7 @@ def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None
     """
     from acquire.cell import cell_of_session, robot_model_of
     from calibrate.second_look import see_sessions
-    from drivers.errors import SettingsError
+    from drivers.errors import DataError, SettingsError
     from measure.run_scene import scene_of
     from measure.verify import verify
     from measure.viewer import write_recording
@@ -103,6 +104,9 @@ def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None
     shots = see_sessions(trained, cell=cell, model=robot_model_of(cell, trained[0])).shots if trained else ()
     verification = verify(calibration, unseen) if unseen else None
     scene = scene_of(calibration, cell, shots, verification=verification, workpiece=workpieces[0] if workpieces else None)
+    if not scene.steps:
+        message = "no clouds to show: no scan shows a sphere or a workpiece, and external reference points have none"
+        raise DataError(message, file=sessions[0].folder, remedy=_SCANS)
     write_recording(out, scene)
 
 

@@ -63,12 +63,14 @@ def test_commands_that_need_scans_say_so(sessions: Path, tmp_path: Path, capfd: 
     assert told(capfd, "calibrate", sessions / "tracker", "-o", tmp_path / "c.yaml")[0] == 0
     for command, reason in (
         (("verify", tmp_path / "c.yaml", sessions / "tracker"), "external reference points alone"),
+        (("show", tmp_path / "c.yaml", sessions / "tracker", "-o", tmp_path / "run.rrd"), "no clouds to show"),
         (("stitch", tmp_path / "c.yaml", sessions / "tracker", "-o", tmp_path / "cloud.ply"), "no good scan"),
         (("stitch", tmp_path / "c.yaml", sessions / "mixed", "-o", tmp_path / "cloud.ply"), "robot alone"),
     ):
         code, data = told(capfd, *command)
         assert code == 1
         assert reason in json.dumps(data["error"])
+    assert not (tmp_path / "run.rrd").exists()
 
 
 def test_mixed_sessions_are_verified_stitched_and_searched_on_their_scans(sessions: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
