@@ -143,7 +143,7 @@ class UrRobot:
         if not self._touched:
             return  # nothing of ours runs there, and nobody else's program is ended
         try:
-            dashboard.end_program(self._address, Deadline.after(SILENCE_S))
+            dashboard.end_program(self._address, Deadline.after(dashboard.ASK_S))
         except RobotError as error:
             error.remedy = "Press the emergency stop if the robot moves: it could not be told to stop."
             raise

@@ -44,7 +44,7 @@ BUTTONS = {
 }
 """What a person does at the controller."""
 
-_HAND_RAD_S = 1.0
+_HAND_RAD_S = 2.0
 
 
 @dataclass(slots=True)

@@ -27,7 +27,7 @@ class TestUrRobot(RobotContract):
         return RobotRig(
             make=lambda: robot_at(controller.host),
             targets_rad=np.array([HOME, AWAY]),
-            speed_rad_s=1.0,
+            speed_rad_s=1.2,
             model=MODEL,
             nobody={"refuses": lambda: robot_at(own_address(2)), "black_hole": lambda: robot_at(black_hole)},
             faults={name: lambda name=name: controller.fault(name) for name in names},  # type: ignore[misc]

@@ -70,7 +70,15 @@ def first_error(action: Callable[[], object], *kinds: type[RobotError]) -> Robot
     return require_raises(repeat, *kinds)
 
 
-@pytest.mark.parametrize(("fault", "kind"), [("refuse", RobotNotReached), ("black_hole", RobotNotReached), ("silence", RobotTimeout)])
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [
+        ("silence", RobotTimeout),
+        # the contract has these two at addresses where nobody is
+        pytest.param("refuse", RobotNotReached, marks=pytest.mark.qualify),
+        pytest.param("black_hole", RobotNotReached, marks=pytest.mark.qualify),
+    ],
+)
 def test_open(controller: FakeUr, fault: str, kind: type[RobotError]) -> None:
     controller.fault(fault)
     robot = robot_at(controller.host)
@@ -82,16 +90,16 @@ def test_open(controller: FakeUr, fault: str, kind: type[RobotError]) -> None:
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [
-        ("half_packets", RobotTimeout),
-        ("refuse", LinkLost),
+        ("drop", LinkLost),
+        pytest.param("half_packets", RobotTimeout, marks=pytest.mark.qualify),
+        pytest.param("refuse", LinkLost, marks=pytest.mark.qualify),
         pytest.param("restart 60", LinkLost, marks=pytest.mark.qualify),
         pytest.param("lag 0.2", StaleReading, marks=pytest.mark.qualify),
-        # the contract has silence, drop and stale in the ordinary suite
+        # the contract has silence and stale in the ordinary suite
         pytest.param("silence", RobotTimeout, marks=pytest.mark.qualify),
         pytest.param("black_hole", RobotTimeout, marks=pytest.mark.qualify),
         pytest.param("stale", StaleReading, marks=pytest.mark.qualify),
         pytest.param("slow 0.3", RobotTimeout, marks=pytest.mark.qualify),
-        pytest.param("drop", LinkLost, marks=pytest.mark.qualify),
     ],
 )
 def test_in_mid_move(controller: FakeUr, robot: UrRobot, fault: str, kind: type[RobotError]) -> None:
@@ -118,6 +126,7 @@ def test_in_mid_move(controller: FakeUr, robot: UrRobot, fault: str, kind: type[
     assert controller.n_motions() == count
 
 
+@pytest.mark.qualify
 def test_packages_in_pieces_do_no_harm(controller: FakeUr, robot: UrRobot) -> None:
     controller.fault("fragments")
     list(move(robot, AWAY, FAST))
@@ -160,7 +169,7 @@ def test_a_cut_commanding_link_stays_cut(controller: FakeUr, robot: UrRobot) -> 
         ("protective_stop", Safety.PROTECTIVE_STOP, ProtectiveStop),
         ("safeguard_stop", Safety.SAFEGUARD_STOP, SafeguardStop),
         pytest.param("emergency_stop", Safety.EMERGENCY_STOP, EmergencyStop, marks=pytest.mark.qualify),
-        ("safety_fault", Safety.FAULT, SafetyStop),
+        pytest.param("safety_fault", Safety.FAULT, SafetyStop, marks=pytest.mark.qualify),
     ],
 )
 def test_stops_in_mid_move(controller: FakeUr, robot: UrRobot, button: str, safety: Safety, kind: type[SafetyStop]) -> None:
@@ -243,7 +252,6 @@ def test_taken_registers_are_left_to_their_owner(controller: FakeUr) -> None:
     robot = robot_at(controller.host, upper_registers=True)
     robot.open()
     try:
-        list(move(robot, AWAY, FAST))
         list(move(robot, HOME, FAST))
     finally:
         robot.close()
