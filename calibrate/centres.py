@@ -220,7 +220,7 @@ def fits_of_solution(solution: Solution) -> CentreFits:
 def _point_noise(sums: ShotSums, noise: NoiseModel, *, first: bool) -> NoiseModel:
     found = estimate_point_noise(sums.patches, noise)
     if not first:
-        found = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.bands, found))
+        found = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.patches, found))
     # centres of noise-free points are known so well beside poses that the elimination of these would drown in rounding
     return replace(found, point_mm=max(found.point_mm, _LEAST_SHARE * max(noise.pose_mm, _LEVER_MM * noise.pose_rad)))
 

@@ -18,6 +18,7 @@ from drivers.kinematics.se3 import FloatArray
 
 _FIRST_ESTIMATES, _LATER_ESTIMATES = 6, 3
 """Passes in which the noise model is estimated anew, from a rough start and from a good one; later ones hold it."""
+_MORE_ESTIMATES, _STANDS_MM = 4, 2e-5
 _FIRST_SWEEPS = 4
 _STEP_TOLERANCE_MM = 1e-7
 _STALL_TOLERANCE_MM = 1e-5
@@ -100,10 +101,13 @@ def _descend(problem: Problem, state: State, noise: NoiseModel, n_estimates: int
     rough, step_mm = n_estimates == _FIRST_ESTIMATES, np.inf
     for passes in range(1, _MAX_PASSES + 1):
         geometry, rows = linearise_geometry(problem, state), external_rows(problem, state)
-        estimating, first = passes <= n_estimates, rough and passes == 1
+        # held only once the state stands: what the noise model is must not depend on where the solve began
+        estimating = passes <= n_estimates or (0 < n_estimates < passes <= n_estimates + _MORE_ESTIMATES and step_mm > _STANDS_MM)
+        first = rough and passes == 1
         sums = shot_sums(problem, state, geometry, None if first else noise, patches=estimating)
         if estimating:
-            noise = _estimate_noise(problem, state, geometry, sums, rows, noise, sweeps=0 if first else _FIRST_SWEEPS if passes == 2 else 1)
+            sweeps = None if first else _FIRST_SWEEPS if rough and passes == 2 else 0
+            noise = _estimate_noise(problem, state, geometry, sums, rows, noise, sweeps=sweeps)
         near = step_mm < _NEAR_MM
         curved = _sums_of_all(problem, state, geometry, sums, sums.curved_moments if near else sums.moments, rows, noise)
         step, noise_step = normal.solve_step(curved, normal.reduce(curved, noise.pose_precision))
@@ -138,14 +142,14 @@ def _sums_of_all(
 
 
 def _estimate_noise(
-    problem: Problem, state: State, geometry: Geometry, sums: ShotSums, rows: ExternalRows | None, noise: NoiseModel, *, sweeps: int
+    problem: Problem, state: State, geometry: Geometry, sums: ShotSums, rows: ExternalRows | None, noise: NoiseModel, *, sweeps: int | None
 ) -> NoiseModel:
-    """Points first, then (in so many sweeps) poses."""
+    """Points first, then poses: in so many sweeps of parabolas, by Newton steps for 0, not at all for None."""
     if problem.n_shots:
         noise = estimate_point_noise(sums.patches, noise)
-        if problem.along_sight and sweeps:
-            noise = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.bands, noise))
-    if not sweeps:
+        if problem.along_sight and sweeps is not None:
+            noise = estimate_range_growth(sums.patches, sums.range_mm, estimate_incidence(sums.patches, noise))
+    if sweeps is None:
         return noise
     spheres = normal.linearise(problem, state, geometry, sums.moments, sums.weight(noise))
     return _estimate_pose_noise(spheres, rows, noise, sweeps=sweeps)

@@ -108,9 +108,8 @@ def _add_patches(
     count: float,
     n: int,
     patches: FloatArray,
-    bands: FloatArray,
 ) -> None:
-    """Add number, sum and sum of squares of the residuals to those of their patch (12, 3) and incidence band (6, 3).
+    """Add to each point's patch (12, 7): its number, residual, residual², normal and cos².
 
     Caps are cut into six sectors of two rings about the line of sight to the centre, profiles (cosine 0) into twelve
     pieces along the arc. Residuals beyond the cutoff are left out.
@@ -129,14 +128,13 @@ def _add_patches(
             patch = sector + (6 if a * a + b * b > 0.375 else 0)
         else:
             patch = int(12.0 * (first + i) / count)
-        band = min(int(cosines[i] * cosines[i] * bands.shape[0]), bands.shape[0] - 1)
-        squared = residual * residual
         patches[patch, 0] += 1.0
         patches[patch, 1] += residual
-        patches[patch, 2] += squared
-        bands[band, 0] += 1.0
-        bands[band, 1] += cosines[i] * cosines[i]
-        bands[band, 2] += squared
+        patches[patch, 2] += residual * residual
+        patches[patch, 3] += rows[0, i]
+        patches[patch, 4] += rows[1, i]
+        patches[patch, 5] += rows[2, i]
+        patches[patch, 6] += cosines[i] * cosines[i]
 
 
 @vectorised
@@ -163,15 +161,14 @@ def shot_sums(
     moments: FloatArray,
     counts: FloatArray,
     patches: FloatArray,
-    bands: FloatArray,
 ) -> None:
     """Fill `moments` (m, v, v), the weighted sums of w w' per shot, w = (u, terms along u, -1, residual).
 
     Points (N, 3) and centres (m, 3) are in the camera frame, shot j owns points starts[j]:starts[j+1]. A point whose
     sight meets the sphere at cosine c has variance s² = incidence[0] + incidence[1] c² relative to the shot's, and the
     weight 1 / s² times Geman-McClure's 1 / (1 + (r / (cutoff s))²)². `counts` (m, 4) receives the sums of the weights and of
-    r², the number of points, and the sum of the weights that the second derivative of the robust loss has. `patches` (m, 12, 3) and
-    `bands` (m, 6, 3), see `_add_patches`, are filled unless they are empty.
+    r², the number of points, and the sum of the weights that the second derivative of the robust loss has. `patches` (m, 12, 7),
+    see `_add_patches`, is filled unless it is empty.
     """
     n_terms, highest = table.axis.shape[0], table.forward.shape[0]
     size = n_terms + 5
@@ -211,7 +208,7 @@ def shot_sums(
             _add_outer(rows, weights, n, weighted, sums)
             if patches.shape[0] > 0:
                 first_in_shot, count = float(first - starts[j]), float(starts[j + 1] - starts[j])
-                _add_patches(rows, cosines, cutoffs[j], frame, first_in_shot, count, n, patches[j], bands[j])
+                _add_patches(rows, cosines, cutoffs[j], frame, first_in_shot, count, n, patches[j])
         for a in range(size):
             for b in range(a, size):
                 moments[j, a, b] = sums[a, b]

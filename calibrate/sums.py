@@ -12,7 +12,6 @@ from drivers.kinematics.se3 import FloatArray
 
 POINT_CUTOFF_SIGMAS = 5.0
 """Geman-McClure cutoff in standard deviations: a clean point keeps 92 % of its weight on average."""
-INCIDENCE_BANDS = 6
 _LEAST_CURVATURE = 0.2
 
 
@@ -25,9 +24,7 @@ class ShotSums:
     counts: FloatArray
     """(m, 4): sums of the weights, of r², number of points, and sum of the weights that the curvature of the loss has."""
     patches: FloatArray
-    """(m, 12, 3) number, sum and sum of squares of the residuals by patch; (0, 12, 3) where not asked for."""
-    bands: FloatArray
-    """(m, 6, 3) number of points, sums of cos² and of r² by band of incidence; (0, 6, 3) where not asked for."""
+    """(m, 12, 7) number of points, sums of r, r², normal and cos² of incidence by patch; (0, 12, 7) where not asked for."""
     range_mm: FloatArray
     """(m,) from the camera to the sphere's centre."""
 
@@ -66,7 +63,7 @@ def shot_moments(problem: Problem, state: State, geometry: Geometry, cutoff_mm: 
 
 
 def patch_sums(problem: Problem, state: State, geometry: Geometry, cutoff_mm: float) -> FloatArray:
-    """(m, 12, 3) numbers, sums and sums of squares of the residuals by patch of each shot."""
+    """(m, 12, 7) sums of each shot by patch, see `ShotSums`."""
     range_mm = np.zeros(problem.n_shots)
     return _sums(problem, state, geometry, np.full(problem.n_shots, cutoff_mm), (1.0, 0.0), range_mm, patches=True).patches
 
@@ -84,10 +81,7 @@ def _sums(
     from calibrate import moments_kernels
 
     m, size = problem.n_shots, problem.layout.n_camera + 5
-    n_patched = m if patches else 0
-    sums = ShotSums(
-        np.zeros((m, size, size)), np.zeros((m, 4)), np.zeros((n_patched, PATCHES, 3)), np.zeros((n_patched, INCIDENCE_BANDS, 3)), range_mm
-    )
+    sums = ShotSums(np.zeros((m, size, size)), np.zeros((m, 4)), np.zeros((m if patches else 0, PATCHES, 7)), range_mm)
     moments_kernels.shot_sums(
         problem.points_in_camera_mm,
         problem.starts,
@@ -101,6 +95,5 @@ def _sums(
         sums.moments,
         sums.counts,
         sums.patches,
-        sums.bands,
     )
     return sums

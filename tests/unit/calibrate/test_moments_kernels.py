@@ -91,7 +91,7 @@ def test_patches_share_out_every_point_within_the_cutoff(camera_error: CameraErr
     shot = np.repeat(np.arange(problem.n_shots), np.diff(problem.starts))
     for cutoff_mm in (np.inf, 1.001 * float(np.median(np.abs(residual)))):
         sums = patch_sums(problem, state, geometry, cutoff_mm)
-        assert sums.shape == (problem.n_shots, 12, 3)
+        assert sums.shape == (problem.n_shots, 12, 7)
         kept = np.abs(residual) <= cutoff_mm
         for power in range(3):
             expected = np.bincount(shot[kept], weights=residual[kept] ** power, minlength=problem.n_shots)
@@ -173,17 +173,14 @@ def test_points_weigh_by_their_incidence_and_range(camera_error: CameraError, al
         np.testing.assert_allclose(sums.moments[j], (rows[own] * weight[:, None]).T @ rows[own], rtol=1e-9, atol=1e-9)
 
 
-def test_bands_share_out_the_points_by_incidence() -> None:
+def test_patches_hold_the_sums_of_normals_and_incidence() -> None:
     problem, state, geometry = noisy(PillowError(), True)
-    sums = shot_sums(problem, state, geometry, None, patches=True)
-    rows = point_rows(problem, state, geometry)
-    np.testing.assert_allclose(sums.bands[:, :, 0].sum(axis=1), np.diff(problem.starts))
-    np.testing.assert_allclose(sums.bands[:, :, 2].sum(), (rows[:, -1] ** 2).sum(), rtol=1e-9)
-    mean = sums.bands[..., 1].sum(axis=0) / np.maximum(sums.bands[..., 0].sum(axis=0), 1)
-    filled = sums.bands[..., 0].sum(axis=0) > 0
-    assert (np.diff(mean[filled]) > 0).all()
-    assert ((mean * 6 - np.arange(6))[filled] <= 1.0).all()
-    assert ((mean * 6 - np.arange(6))[filled] >= 0.0).all()
+    patches = shot_sums(problem, state, geometry, None, patches=True).patches
+    normals, cosine = point_rows(problem, state, geometry)[:, :3], cosines(problem, state, geometry)
+    for j in range(problem.n_shots):
+        own = slice(problem.starts[j], problem.starts[j + 1])
+        np.testing.assert_allclose(patches[j, :, 3:6].sum(axis=0), normals[own].sum(axis=0), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(patches[j, :, 6].sum(), (cosine[own] ** 2).sum(), rtol=1e-9)
 
 
 def test_threads_change_nothing() -> None:

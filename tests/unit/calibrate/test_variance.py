@@ -114,7 +114,7 @@ def sums_of(problem: Problem, state: State) -> ShotSums:
 
 def test_noise_along_the_sight_shows_as_the_square_of_the_cosine() -> None:
     """Its share of a residual along the normal; nothing is left where the sight grazes, but some trust is always withheld."""
-    found = estimate_incidence(sums_of(*made(4, 60, 500, 0.08, (0.0, 0.0))).bands, replace(FIRST, form_mm=0.0))
+    found = estimate_incidence(sums_of(*made(4, 60, 500, 0.08, (0.0, 0.0))).patches, replace(FIRST, form_mm=0.0))
     assert 0.1 <= found.flat < 0.22
     cos2 = 7 / 12
     assert found.flat + found.steep * cos2 == pytest.approx(1.0, abs=0.08)
@@ -125,7 +125,7 @@ def test_noise_of_the_surface_shows_at_every_incidence() -> None:
     rng, centre = np.random.default_rng(5), np.repeat(linearise_geometry(problem, state).centre_in_camera_mm, np.diff(problem.starts), axis=0)
     away = problem.points_in_camera_mm - centre
     noisy = problem.points_in_camera_mm + away / np.linalg.norm(away, axis=1)[:, None] * rng.normal(0, 0.05, (len(away), 1))
-    found = estimate_incidence(sums_of(replace(problem, points_in_camera_mm=noisy), state).bands, replace(FIRST, form_mm=0.0))
+    found = estimate_incidence(sums_of(replace(problem, points_in_camera_mm=noisy), state).patches, replace(FIRST, form_mm=0.0))
     assert found.flat > 0.85
 
 
