@@ -21,9 +21,14 @@
     │       └── EmergencyStop
     └── CameraError(RuntimeError)
         ├── CameraNotReached(ConnectionError)
+        │   ├── CameraLost                         it answered, and does so no more
+        │   └── CameraBusy                         another client holds it
         ├── CameraTimeout(TimeoutError)
-        ├── InvalidFrame(ValueError)           a frame that must not be used (stale, incomplete, wrong unit)
-        └── CameraMisconfigured(ValueError)
+        ├── InvalidFrame(ValueError)           a frame that must not be used (wrong shape, wrong unit)
+        │   ├── IncompleteFrame                    packets or bytes are missing
+        │   └── StaleFrame                         exposed before the trigger, or seen before
+        ├── CameraMisconfigured(ValueError)
+        └── CameraSdkMissing(ImportError)      the vendor's library is not installed
 
 Every error carries what was found (`message`), the file and the place in it, and what to do (`remedy`).
 Double inheritance lets a caller catch either our tree or the builtin it knows. A ValueError of Python itself
@@ -156,6 +161,14 @@ class CameraNotReached(CameraError, ConnectionError):
     """No camera at the address, or the link was lost."""
 
 
+class CameraLost(CameraNotReached):
+    """The camera answered, and does so no more; open it anew, its settings may be gone."""
+
+
+class CameraBusy(CameraNotReached):
+    """The camera answers, and another client holds it."""
+
+
 class CameraTimeout(CameraError, TimeoutError):
     """No frame came within the deadline."""
 
@@ -168,5 +181,17 @@ class InvalidFrame(CameraError, ValueError):
     retryable = True
 
 
+class IncompleteFrame(InvalidFrame):
+    """A frame that lacks packets or bytes."""
+
+
+class StaleFrame(InvalidFrame):
+    """A frame that was exposed before its trigger, or has been handed over before."""
+
+
 class CameraMisconfigured(CameraError, ValueError):
     """The camera is set in a way that would spoil a calibration (transform active, wrong unit)."""
+
+
+class CameraSdkMissing(CameraError, ImportError):
+    """The camera's own library is not installed, or cannot be loaded."""

@@ -152,16 +152,27 @@ class HandGuided(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """Identity that a calibration is bound to."""
+    """Identity that a calibration is bound to: another serial, preset or on-board correction needs another calibration."""
 
     adapter: str
     model: str | None = None
     serial: str | None = None
     firmware: str | None = None
     settings_digest: str | None = None
+    """Of everything that was set and that changes where points lie."""
     onboard_correction: str | None = None
+    """Name or time stamp of a correction that the camera applies by itself (Zivid: infield correction)."""
     working_range_mm: tuple[float, float] | None = None
     kind: Literal["area", "line_profile"] = "area"
+    vendor: str | None = None
+    sdk_version: str | None = None
+    notes: tuple[str, ...] = ()
+    """What an operator should know of the camera's settings; `doctor` tells them as hints."""
+
+    def identity(self) -> dict[str, str]:
+        """What is known of the parts that a calibration is bound to, under the keys of a cell's `identity`."""
+        known = {"camera_serial": self.serial, "camera_settings": self.settings_digest, "camera_correction": self.onboard_correction}
+        return {key: value for key, value in known.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,14 +188,32 @@ class Frame3D:
     intensity: NDArray[np.float32] | None = None
     """(height, width), 0..1."""
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
+    quality: NDArray[np.float32] | None = None
+    """(height, width), higher is better; what it means is told by `quality_kind`."""
+    quality_kind: Literal["snr", "confidence"] | None = None
+    done_s: float | None = None
+    """`time.monotonic()` when the frame had come whole."""
+    device_time_ns: int | None = None
+    """The camera's own time stamp of the exposure."""
+    diagnostics: Mapping[str, float | int | str] = field(default_factory=dict)
+    """Whatever tells how well the transport works: lost and resent packets, file name, frame number of the camera."""
 
 
 @runtime_checkable
 class Camera3D(Protocol):
-    """A 3D camera that gives one fresh frame per call."""
+    """A 3D camera that gives one fresh frame per call (docs/add_a_camera.md; `drivers.contract.camera` tests it).
+
+    One thread owns it; while a call waits, the application's other threads run on.
+    """
 
     def open(self) -> CameraInfo:
-        """Connect and apply the settings."""
+        """Connect and apply the settings, every time anew.
+
+        Raises:
+            CameraNotReached: nobody answers (within 3 s), or another client holds it (CameraBusy).
+            CameraMisconfigured: its settings would spoil a calibration.
+            CameraSdkMissing: the vendor's library is not installed.
+        """
         ...
 
     def capture(self, *, timeout_s: float) -> Frame3D:

@@ -27,10 +27,14 @@ _BUILT_IN: dict[str, dict[str, str]] = {
         "ur_rtde": "drivers.ur_rtde:make_robot",
         "abb_socket": "drivers.abb:make_robot",
     },
-    CAMERA_GROUP: {"simulated": "drivers.simulated:make_camera", "recorded": "drivers.recorded:make_camera"},
+    CAMERA_GROUP: {
+        "simulated": "drivers.simulated:make_camera",
+        "recorded": "drivers.recorded:make_camera",
+        "folder": "drivers.cameras.folder:make_camera",
+    },
 }
 
-NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket"})
+NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder"})
 """Drivers without a signed hardware log in docs/; every report says so."""
 
 

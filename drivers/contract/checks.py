@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from drivers.contract.rig import RobotRig
-from drivers.errors import RobotError
+from drivers.errors import CameraError, RobotError, SpherecalError
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import CameraInfo, Frame3D, Robot, RobotState
 
@@ -37,7 +37,7 @@ def require(good: bool, what_is_wrong: str) -> None:
         raise ContractBroken(what_is_wrong)
 
 
-def require_raises(action: Callable[[], object], *kinds: type[RobotError]) -> RobotError:
+def require_raises(action: Callable[[], object], *kinds: type[SpherecalError]) -> SpherecalError:
     """The error that the action ends in, which must be of one of the kinds and say what to do.
 
     Raises:
@@ -45,7 +45,7 @@ def require_raises(action: Callable[[], object], *kinds: type[RobotError]) -> Ro
     """
     try:
         action()
-    except RobotError as error:
+    except (RobotError, CameraError) as error:
         require(isinstance(error, kinds), f"{type(error).__name__} ({error}) instead of {_names(kinds)}")
         require(bool(error.remedy), f"{type(error).__name__} without a remedy: {error}")
         return error
@@ -138,7 +138,7 @@ def wait_for(robot: Robot, good: Callable[[RobotState], bool], patience_s: float
     return state
 
 
-def until_it_raises(robot: Robot, *kinds: type[RobotError]) -> RobotError:
+def until_it_raises(robot: Robot, *kinds: type[RobotError]) -> SpherecalError:
     """Read until a reading fails, which must be with one of the kinds."""
 
     def read_on() -> None:
@@ -196,7 +196,7 @@ def _flange_change(state: RobotState, before: RobotState) -> float:
     return float(np.linalg.norm(state.base_from_flange[:3, 3] - before.base_from_flange[:3, 3])) / 1000
 
 
-def _names(kinds: tuple[type[RobotError], ...]) -> str:
+def _names(kinds: tuple[type[SpherecalError], ...]) -> str:
     return " or ".join(kind.__name__ for kind in kinds)
 
 
