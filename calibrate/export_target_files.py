@@ -22,16 +22,14 @@ import numpy as np
 from drivers.errors import FileError
 from drivers.files.checks import Record, as_mapping
 from drivers.files.disk import read_text
+from drivers.files.rapid_targets import NO_EXTERNAL_AXIS, RapidTarget, rapid_targets, without_remarks
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
-NO_EXTERNAL_AXIS = 9e9
 _POSE_COLUMNS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 _QUATERNION_TOLERANCE = 1e-3
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-_RAPID = re.compile(r"\b(?P<type>robtarget|jointtarget)\s+(?P<name>[A-Za-z]\w*)\s*(?P<array>\{[^}]*\})?\s*(?P<value>:=[^;]*)?;", re.IGNORECASE)
 _CORRECTED = re.compile(r"^[#!] spherecal calibration [0-9a-f]{64}", re.MULTILINE)
-_RAPID_SHAPES = {"robtarget": (3, 4, 4, 6), "jointtarget": (6, 6)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +68,7 @@ def parse_targets(text: str, n_joints: int, *, file: str | Path) -> tuple[Target
         raise FileError("holds targets that spherecal has corrected already", file=file, remedy="Give the nominal targets they were made from.")
     if text.lstrip()[:1] in ("[", "{"):
         targets = _json_targets(text, n_joints, file)
-    elif re.search(r"\b(robtarget|jointtarget)\b", _without_rapid_comments(text), re.IGNORECASE):
+    elif re.search(r"\b(robtarget|jointtarget)\b", without_remarks(text), re.IGNORECASE):
         targets = _rapid_targets(text, n_joints, file)
     else:
         targets = _csv_targets(text, n_joints, file)
@@ -150,38 +148,18 @@ def _csv_columns(header: list[str], n_joints: int, file: str | Path) -> tuple[tu
 def _rapid_targets(text: str, n_joints: int, file: str | Path) -> tuple[Target, ...]:
     if n_joints != 6:
         raise FileError(f"RAPID targets are for six axes, this robot has {n_joints}", file=file, remedy="Give the targets as CSV or JSON.")
-    plain = _without_rapid_comments(text)
-    return tuple(_rapid_target(match, plain, file) for match in _RAPID.finditer(plain) if match["value"] or match["array"])
+    return tuple(_rapid_target(target, file) for target in rapid_targets(text, file=file) if target.declared)
 
 
-def _rapid_target(match: re.Match[str], text: str, file: str | Path) -> Target:
-    where, kind = f"line {text.count(chr(10), 0, match.start()) + 1}, {match['name']}", match["type"].lower()
-    if match["array"]:
-        raise FileError("is an array of targets", file=file, where=where, remedy="Declare every target by itself.")
-    parts = _rapid_parts(match["value"][2:], _RAPID_SHAPES[kind])
-    if parts is None:
-        shape = ",".join(f"[{n} numbers]" for n in _RAPID_SHAPES[kind])
-        raise FileError(f"is no {kind} in plain numbers", file=file, where=where, remedy=f"Write [{shape}].")
-    external = tuple(parts[-1].tolist())
-    if kind == "jointtarget":
-        return Target(match["name"], where, joints_rad=np.radians(parts[0]), external=external)
+def _rapid_target(target: RapidTarget, file: str | Path) -> Target:
+    if target.from_array:
+        raise FileError("is an array of targets", file=file, where=target.where, remedy="Declare every target by itself.")
+    parts = target.parts
+    if target.kind == "jointtarget":
+        return Target(target.name, target.where, joints_rad=np.radians(parts[0]), external=target.external)
     quadrants = [round(value) for value in parts[2][:3]]
-    pose = _pose(np.concatenate(parts[:2]), file, where)
-    return Target(match["name"], where, base_from_flange=pose, quadrants=(quadrants[0], quadrants[1], quadrants[2]), external=external)
-
-
-def _rapid_parts(value: str, shape: tuple[int, ...]) -> list[FloatArray] | None:
-    """The arrays of `[[...],[...]]`; None unless their lengths are as in shape."""
-    groups = ",".join(rf"\[({','.join([_NUMBER.pattern] * n)})\]" for n in shape)
-    match = re.fullmatch(rf"\[{groups}\]", "".join(value.split()))
-    if match is None:
-        return None
-    parts = [np.array(group.split(","), dtype=np.float64) for group in match.groups()]
-    return parts if all(np.isfinite(part).all() for part in parts) else None
-
-
-def _without_rapid_comments(text: str) -> str:
-    return re.sub(r"!.*", "", text)
+    pose = _pose(np.concatenate(parts[:2]), file, target.where)
+    return Target(target.name, target.where, base_from_flange=pose, quadrants=(quadrants[0], quadrants[1], quadrants[2]), external=target.external)
 
 
 def _pose(values: FloatArray, file: str | Path, where: str) -> FloatArray:
