@@ -13,6 +13,24 @@ from acquire.motion import MotionSettings
 from acquire.plan import PlannedPose
 from acquire.sphere import SphereSettings
 
+FIRST_SPEED_RAD_S = 0.1
+"""Where nobody has driven before: 100 mm/s a metre from the axis, below the 250 mm/s that robots keep in manual mode."""
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUpSettings:
+    """When a camera counts as warm."""
+
+    most_k_per_min: float = 0.3
+    """Of its fastest temperature sensor, where it has one."""
+    most_mm_per_min: float = 0.01
+    """Of the median distance to whatever it looks at while the robot stands."""
+    every_s: float = 5.0
+    """Between exposures."""
+    window_s: float = 60.0
+    """Over which the drift is taken, and so the shortest warm-up."""
+    longest_s: float = 3600.0
+
 
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
@@ -24,13 +42,26 @@ class CaptureSettings:
     frame_timeout_s: float = 10.0
     sphere: SphereSettings = field(default_factory=SphereSettings)
     most_errors_in_a_row: int = 3
-    """So many poses in a row that the robot refuses or the camera does not see end the run with the last error."""
+    """So many poses in a row that the robot refuses or the camera does not see suspend the run."""
+    most_missing_in_a_row: int | None = 3
+    """So many shots in a row that should show one sphere and do not suspend the run; None never does."""
+    largest_drift_k: float | None = 5.0
+    """So far may a temperature of the camera be from that of the run's first shot; None for any."""
+    warm_up: WarmUpSettings | None = None
+    """Before the first pose; None to begin at once."""
+    first_speed_rad_s: float = FIRST_SPEED_RAD_S
+    """To poses that were appended: nobody has driven there before."""
 
 
 def settings_of(cell: Cell) -> CaptureSettings:
     """The settings that a cell file asks for."""
     motion = MotionSettings(speed_rad_s=cell.motion.speed_rad_s, settle_s=cell.motion.settle_s)
-    return CaptureSettings(motion=motion, frames=cell.motion.frames)
+    return CaptureSettings(
+        motion=motion,
+        frames=cell.motion.frames,
+        most_missing_in_a_row=cell.suspend.missing_spheres,
+        largest_drift_k=cell.suspend.temperature_drift_k,
+    )
 
 
 def planned_seconds(poses: Sequence[PlannedPose], settings: CaptureSettings, exposure_s: float = 1.0) -> float:

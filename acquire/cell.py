@@ -131,6 +131,15 @@ class Motion(StrictModel):
     frames: Annotated[int, Field(ge=1, le=100)] = 1
 
 
+class Suspend(StrictModel):
+    """What suspends a capture run besides trouble with robot and camera; null never does."""
+
+    missing_spheres: Annotated[int, Field(ge=1)] | None = 3
+    """Shots in a row in which one sphere is not found."""
+    temperature_drift_k: Positive | None = 5.0
+    """Of the camera, from the run's first shot on."""
+
+
 Scalar = str | int | float | bool | None
 
 
@@ -153,6 +162,7 @@ class Cell(StrictModel):
     work_volume_mm: Corners | None = None
     obstacles: Annotated[tuple[Obstacle, ...], BeforeValidator(_as_tuple)] = ()
     motion: Motion = Motion()
+    suspend: Suspend = Suspend()
     identity: dict[str, Scalar] = Field(default_factory=dict)
 
     _path: Path = PrivateAttr(default=Path("cell.yaml"))

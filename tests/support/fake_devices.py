@@ -110,7 +110,9 @@ class FakeCamera:
         self.sequence = 0
         self.faults = list(faults)
         self.xyz_mm = frame([(CENTRE_MM, RADIUS_MM)], sight=_SIGHT, noise_mm=0.05)
-        self.before: Callable[[], None] = lambda: None
+        self.before: Callable[[], object] = lambda: None
+        self.warms_k_per_frame = 0.0
+        self.temperature_c = 31.5
 
     def open(self) -> CameraInfo:
         return CameraInfo("fake")
@@ -122,7 +124,9 @@ class FakeCamera:
         if fault is not None:
             raise fault
         self.sequence += 1
-        return Frame3D(xyz_mm=self.xyz_mm, sequence=self.sequence, time_s=0.0, temperatures_c={"housing": 31.5})
+        temperatures_c = {"housing": self.temperature_c}
+        self.temperature_c += self.warms_k_per_frame
+        return Frame3D(xyz_mm=self.xyz_mm.copy(), sequence=self.sequence, time_s=0.0, temperatures_c=temperatures_c)
 
     def close(self) -> None:
         pass

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquire.capture import CaptureSettings, planned_seconds, run_capture, settings_of
-from acquire.cell import Cell
 from acquire.events import (
     Append,
     Captured,
@@ -37,7 +36,6 @@ from acquire.events import (
     Stop,
 )
 from acquire.plan import Plan, PlannedPose
-from acquire.session import SessionWriter
 from drivers.errors import (
     CameraMisconfigured,
     CameraNotReached,
@@ -50,38 +48,9 @@ from drivers.errors import (
     SettingsError,
 )
 from drivers.files.session import read_scan, read_session
-from drivers.protocols import Devices, Safety
-from tests.support.fake_devices import CENTRE_MM, FakeCamera, FakeRobot, fake_cell, fake_devices, fake_plan
-
-Answer = Callable[[Event], Command | None]
-
-
-class Bench:
-    """A cell, its devices and a session to write."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder / "session"
-        self.cell: Cell = fake_cell(folder)
-        self.devices: Devices
-        self.robot: FakeRobot
-        self.camera: FakeCamera
-        self.devices, self.robot, self.camera = fake_devices()
-        self.writer = SessionWriter.create(self.folder, purpose="calibration", cell=self.cell)
-
-    def run(self, plan: Plan, answer: Answer = lambda _: None, capture: CaptureSettings | None = None) -> list[Event]:
-        """Events without Moving; `answer` gives the command to each event."""
-        steps = run_capture(self.devices, self.cell, plan, self.writer, capture)
-        events = [next(steps)]
-        while True:
-            try:
-                events.append(steps.send(answer(events[-1])))
-            except StopIteration:
-                return [event for event in events if not isinstance(event, Moving)]
-
-    def resumed(self) -> None:
-        """As a new process would go on."""
-        self.writer.close()
-        self.writer = SessionWriter.resume(self.folder, cell=self.cell)
+from drivers.protocols import Safety
+from tests.support.capture_bench import Bench, kinds, once, pose_ids
+from tests.support.fake_devices import CENTRE_MM, FakeRobot, fake_plan
 
 
 @pytest.fixture
@@ -89,28 +58,6 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     made = Bench(tmp_path)
     yield made
     made.writer.close()
-
-
-def once(*pairs: tuple[type[Event], Command]) -> Answer:
-    """Each command at the first event of its kind, in this order."""
-    left = list(pairs)
-
-    def answer(event: Event) -> Command | None:
-        if left and isinstance(event, left[0][0]):
-            return left.pop(0)[1]
-        return None
-
-    return answer
-
-
-def kinds(events: list[Event]) -> list[str]:
-    """Names of the events."""
-    return [type(event).__name__ for event in events]
-
-
-def pose_ids(events: list[Event]) -> list[str]:
-    """Poses in the order they were captured."""
-    return [event.pose_id for event in events if isinstance(event, Captured)]
 
 
 ONE_POSE = ["PoseStarted", "Moved", "Settled", "Captured"]
@@ -249,7 +196,7 @@ def test_a_finished_session_needs_nothing_more(bench: Bench) -> None:
 
 def test_without_a_sphere_the_shot_is_kept_as_failed_with_its_scan(bench: Bench) -> None:
     bench.camera.xyz_mm = np.where(np.isfinite(bench.camera.xyz_mm), bench.camera.xyz_mm * [1, 1, 0] + [0, 0, 330], np.nan).astype(np.float32)
-    events = bench.run(fake_plan(5))
+    events = bench.run(fake_plan(5), capture=CaptureSettings(most_missing_in_a_row=None))
     assert kinds(events).count("Failed") == 5
     session = read_session(bench.folder)
     assert {shot.status for shot in session.shots} == {"failed"}
