@@ -18,6 +18,7 @@ from measure.cli_cell import doctor, new_cell
 from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
 from measure.cli_export import export
+from measure.cli_import import import_session
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
 from measure.cli_predict import predict
@@ -45,6 +46,7 @@ app.command("doctor")(doctor)
 app.command("plan")(plan)
 app.command("predict")(predict)
 app.command("capture")(capture)
+app.command("import")(import_session)
 app.command("centres")(centres)
 app.command("calibrate")(calibrate)
 app.command("verify")(verify)
