@@ -111,9 +111,10 @@ def test_spoilt_files_are_told(spoil_and_run: Callable[[random.Random], None]) -
 
 
 @pytest.mark.qualify
-def test_many_spoilt_files_are_told(spoil_and_run: Callable[[random.Random], None]) -> None:
+def test_many_spoilt_files_are_told(spoil_and_run: Callable[[random.Random], None], capfd: pytest.CaptureFixture[str]) -> None:
     seed = random.SystemRandom().randrange(2**32)
-    print(f"seed {seed}")
+    with capfd.disabled():  # every command empties what was caught, and the seed with it
+        print(f"\nqualify spoilt files seed={seed}")
     rng = random.Random(seed)
     for _ in range(2000):
         spoil_and_run(rng)
