@@ -1,31 +1,30 @@
 """A capture run with its session around it: what the command line and the demo share.
 
-The run itself is `acquire.capture`; here are the folder that it fills, the watcher that sees its events, and Ctrl-C.
+The run itself is `acquire.capture`; here are the folder that it fills, the watcher that sees its events, and the record of
+what a real robot has driven (`measure.running_record`).
 """
 
 from __future__ import annotations
 
 import shutil
-import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Literal
 
-from acquire.capture import run_capture
+from acquire.capture import CaptureSettings, run_capture, settings_of
+from acquire.capture_states import RunState
 from acquire.cell import Cell, devices_of, robot_model_of
-from acquire.events import Captured, Command, Event, Failed, Finished, PoseStarted, Skipped, Stop
+from acquire.events import Command, Event, Finished, Moved
 from acquire.plan import Plan, plan_text
 from acquire.session import SessionWriter
 from acquire.session_folder import check_free
 from drivers.protocols import Devices
+from measure.running_record import RunRecord, append_run, motion_digest, now_utc, runs_path
 
 Watcher = Callable[[Event], Command | None]
 """Sees every event of a run and may answer with a command."""
-
-_DONE_WITH_A_POSE = (Captured, Failed, Skipped, PoseStarted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,8 @@ class CaptureResult:
     """Good shots of the session, those of earlier runs included."""
     n_failed: int
     n_skipped: int
-    state: Literal["complete", "stopped"]
+    state: Literal["complete", "enough", "stopped"]
+    """Enough: what was wanted was reached before the last pose."""
 
     def to_json_dict(self) -> Mapping[str, object]:
         """What `spherecal capture --json` prints."""
@@ -50,34 +50,86 @@ def moves_a_real_robot(cell: Cell) -> bool:
     return not (cell.robot.driver == "recorded" or (cell.robot.driver == "simulated" and instant))
 
 
-def capture_session(cell: Cell, plan: Plan, out: Path, *, watcher: Watcher, resume: bool = False) -> CaptureResult:
+def capture_session(
+    cell: Cell, plan: Plan, out: Path, *, watcher: Watcher, resume: bool = False, settings: CaptureSettings | None = None, stepped: bool = False
+) -> CaptureResult:
     """Run a plan in a cell and record it; a session that holds no shot when the run fails is taken away again.
+
+    What a real robot has driven is added to the runs of the cell, however the run ends.
+
+    Args:
+        cell: whose devices are used.
+        plan: the poses.
+        out: the session's folder.
+        watcher: sees every event.
+        resume: go on with the session.
+        settings: `settings_of(cell)` if None.
+        stepped: whether somebody lets the robot go to every single pose.
 
     Raises:
         RobotError: as `acquire.capture.run_capture`; the robot is stopped.
         CameraError: likewise.
-        FileError: the session cannot be written, or is not empty and not to be resumed.
+        DataError: a sphere is missing or the camera drifts, and nobody answered.
+        FileError: the session or the cell's runs cannot be written, or the folder is not empty and not to be resumed.
         SettingsError: the devices cannot be made, or `resume` with another cell.
         KeyboardInterrupt: somebody or something wants the run to end now; the robot is stopped.
     """
-    devices = devices_of(cell)
+    devices, how = devices_of(cell), settings or settings_of(cell)
     if not resume:
         check_free(out)  # before a robot is even connected
-    with devices, _session(cell, plan, out, resume) as writer:
-        finished = _drive(devices, cell, plan, writer, watcher)
+    with devices, _session(cell, plan, out, resume) as writer, _recorded(cell, plan, out, how, stepped) as diary:
+
+        def watch(event: Event) -> Command | None:
+            diary.note(event)
+            return watcher(event)
+
+        finished = _drive(devices, cell, plan, writer, watch, how)
         shots = [shot for shot in writer.shots if not any(later.replaces == shot.index for later in writer.shots)]
     counts = {status: sum(shot.status == status for shot in shots) for status in ("ok", "failed", "skipped")}
-    return CaptureResult(out, counts["ok"], counts["failed"], counts["skipped"], "stopped" if finished.stopped else "complete")
+    return CaptureResult(out, counts["ok"], counts["failed"], counts["skipped"], _ending(finished))
 
 
-def _drive(devices: Devices, cell: Cell, plan: Plan, writer: SessionWriter, watcher: Watcher) -> Finished:
+def _ending(finished: Finished) -> Literal["complete", "enough", "stopped"]:
+    return "stopped" if finished.stopped else "enough" if finished.n_left else "complete"
+
+
+def _drive(devices: Devices, cell: Cell, plan: Plan, writer: SessionWriter, watcher: Watcher, settings: CaptureSettings) -> Finished:
     """Feed the watcher's commands to the run. However this ends, the generator is closed and so the robot stopped."""
-    with closing(run_capture(devices, cell, plan, writer, model=robot_model_of(cell))) as run:
+    with closing(run_capture(devices, cell, plan, writer, settings, model=robot_model_of(cell))) as run:
         event = next(run)
         while not isinstance(event, Finished):
             event = run.send(watcher(event))
         watcher(event)
         return event
+
+
+class _Diary:
+    """What a run reached."""
+
+    def __init__(self) -> None:
+        self.state = RunState.FAILED
+        self.driven: dict[str, None] = {}
+
+    def note(self, event: Event) -> None:
+        """Take one event."""
+        if isinstance(event, Moved):
+            self.driven[event.pose_id] = None
+        if isinstance(event, Finished):
+            self.state = event.state
+
+
+@contextmanager
+def _recorded(cell: Cell, plan: Plan, out: Path, settings: CaptureSettings, stepped: bool) -> Iterator[_Diary]:
+    diary = _Diary()
+    try:
+        yield diary
+    finally:
+        if diary.driven and moves_a_real_robot(cell):
+            session, speed = str(out.absolute()), settings.motion.speed_rad_s
+            append_run(
+                runs_path(cell),
+                RunRecord(now_utc(), motion_digest(plan), cell.sha256, session, stepped, speed, tuple(diary.driven), diary.state.value),
+            )
 
 
 @contextmanager
@@ -93,30 +145,3 @@ def _session(cell: Cell, plan: Plan, out: Path, resume: bool) -> Iterator[Sessio
             if was_there:
                 out.mkdir()
         raise
-
-
-class StopOnInterrupt:
-    """Ctrl-C once: the run ends when the shot in hand is on disk. Twice: KeyboardInterrupt, and the robot stops now."""
-
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self.asked = False
-        self._tell = tell
-
-    @contextmanager
-    def watching(self) -> Iterator[None]:
-        """Take SIGINT while the block runs."""
-        former = signal.signal(signal.SIGINT, self._interrupted)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, former)
-
-    def command_at(self, event: Event) -> Command | None:
-        """A Stop, once asked for, as soon as no pose is in hand."""
-        return Stop() if self.asked and isinstance(event, _DONE_WITH_A_POSE) else None
-
-    def _interrupted(self, _number: int, _frame: FrameType | None) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-        self._tell("Ctrl-C: the run ends after this shot; once more stops the robot now")

@@ -30,6 +30,7 @@ from drivers.simulated.truth_file import load_truth, write_truth
 from drivers.transport import TcpLink
 from measure.cli import app
 from measure.cli_run import run_app
+from tests.support.driven import mark_driven
 from tests.system.conftest import Cli, SmallCell
 
 N_CALIBRATION, N_VERIFICATION = 20, 6
@@ -128,6 +129,7 @@ def plan_for(work: Work, cell: Path, name: str) -> Path:
     plan = load_plan(work.folder / f"{name}_plan.yaml")
     path = work.folder / f"{cell.stem}_{name}_plan.yaml"
     write_plan(type(plan)(load_cell(cell).sha256, plan.purpose, plan.poses), path)
+    mark_driven(cell, path)
     return path
 
 

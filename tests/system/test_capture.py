@@ -11,12 +11,16 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from acquire.cell import load_cell
-from acquire.plan import load_plan, write_plan
+from acquire.plan import Plan, PlannedPose, load_plan, write_plan
 from drivers.files.session import read_session
+from drivers.files.yaml import dump_yaml, parse_yaml
+from measure.running_record import RunRecord, read_runs
+from tests.support.driven import mark_driven
 from tests.system.conftest import Cli, SmallCell
 
 N_POSES = 4
@@ -33,6 +37,7 @@ def real_time_cell(small: SmallCell, folder: Path, speed_rad_s: float, settle_s:
     plan = load_plan(small.folder / "calibration_plan.yaml")
     short = type(plan)(load_cell(cell).sha256, plan.purpose, plan.poses[:N_POSES])
     write_plan(short, folder / "plan.yaml")
+    mark_driven(cell, folder / "plan.yaml")
     return cell, folder / "plan.yaml"
 
 
@@ -103,7 +108,7 @@ def test_step_by_step_a_pose_is_taken_skipped_or_the_end(small: SmallCell, tmp_p
     ours, theirs = pty.openpty()
     process = started([cell, plan, "-o", tmp_path / "s", "--step", "--json"], stdin=theirs, stderr=theirs)
     os.close(theirs)
-    for answer in (b"\n", b"s\n", b"\n", b"q\n"):
+    for answer in (b"\n", b"s", b"\n", b"q"):
         read_until(ours, b"q ends the run:")
         os.write(ours, answer)
     read_until(ours, None)
@@ -149,7 +154,7 @@ def test_ctrl_c_twice_or_a_termination_stops_now_and_leaves_no_empty_session(sig
     assert process.returncode == 130, err
     assert json.loads(out)["error"]["type"] == "Interrupted"
     assert err.splitlines()[-1] == "interrupted"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.yaml", "plan.yaml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.runs.jsonl", "cell.yaml", "plan.yaml"]
 
 
 def test_a_cell_without_its_truth_leaves_no_session(small: SmallCell, tmp_path: Path, cli: Cli) -> None:
@@ -159,6 +164,88 @@ def test_a_cell_without_its_truth_leaves_no_session(small: SmallCell, tmp_path: 
     assert result.code == 1
     assert "truth.yaml" in result.told["error"]["file"]
     assert list(tmp_path.iterdir()) == [cell]
+
+
+def near_home(small: SmallCell, folder: Path) -> tuple[Path, Path, list[str]]:
+    """A real-time cell, its robot at a pose that sees a sphere, and a plan of three poses close by, never driven."""
+    cell, plan = real_time_cell(small, folder, 8.0, 0.05)
+    home = load_plan(plan).poses[0].joints_rad
+    truth = parse_yaml((small.folder / "truth.yaml").read_text(), file="truth.yaml")
+    if not isinstance(truth, dict):
+        pytest.fail("no truth")
+    truth["robot"]["home_rad"] = home.tolist()
+    (folder / "truth.yaml").write_text(dump_yaml(truth))
+    cell.write_text(cell.read_text().replace(str(small.folder / "truth.yaml"), "truth.yaml"))
+    poses = tuple(PlannedPose(f"h{i}", None, home + 0.01 * (i + 1)) for i in range(3))
+    write_plan(Plan(load_cell(cell).sha256, "workpiece", poses), plan)
+    return cell, plan, [pose.id for pose in poses]
+
+
+def runs_of(cell: Path) -> list[RunRecord]:
+    return list(read_runs(cell.with_suffix(".runs.jsonl")))
+
+
+def answered(arguments: Sequence[object], answers: Sequence[bytes]) -> tuple[int, dict[str, Any], bytes]:
+    """A run at a terminal with one answer per question; exit code, the JSON object, and what was shown."""
+    ours, theirs = pty.openpty()
+    process = started([*arguments, "--json"], stdin=theirs, stderr=theirs)
+    os.close(theirs)
+    shown = b""
+    for answer in answers:
+        shown += read_until(ours, b"q ends the run:")
+        os.write(ours, answer)
+    shown += read_until(ours, None)
+    out, _ = process.communicate(timeout=60)
+    os.close(ours)
+    return process.returncode, json.loads(out), shown
+
+
+def test_the_first_run_of_a_plan_is_attended_slow_and_recorded(small: SmallCell, tmp_path: Path) -> None:
+    cell, plan, names = near_home(small, tmp_path)
+    before = runs_of(cell)
+    process = started([cell, plan, "-o", tmp_path / "s", "--yes"])
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "3 of the plan's 3 poses were never driven" in err
+    assert not (tmp_path / "s").exists()
+    # one pose is left out: it has still to be shown
+    code, told, shown = answered([cell, plan, "-o", tmp_path / "s"], [b"\n", b"s", b"\n"])
+    assert (code, told["n_skipped"], told["state"]) == (0, 1, "complete")
+    assert b"step by step at 0.1 rad/s" in shown
+    assert b"NO safety function" in shown
+    (first,) = runs_of(cell)[len(before) :]
+    assert (first.driven, first.stepped, first.speed_rad_s, first.state) == ((names[0], names[2]), True, 0.1, "done")
+    process = started([cell, plan, "-o", tmp_path / "t", "--yes"])
+    assert "1 of the plan's 3 poses" in process.communicate(timeout=60)[1]
+    # Redo at the third pose takes the second again
+    code, told, shown = answered([cell, plan, "-o", tmp_path / "t"], [b"\n", b"\n", b"r", b"\n", b"\n"])
+    assert (code, told["n_shots"]) == (0, 3)
+    process = started([cell, plan, "-o", tmp_path / "u", "--yes", "--json"])
+    out, err = process.communicate(timeout=60)
+    assert json.loads(out)["n_shots"] == 3, err
+    assert not runs_of(cell)[-1].stepped
+    # another cell file, or a pose moved by a hair, is another plan
+    cell.write_text(cell.read_text() + "# moved the table\n")
+    process = started([cell, plan, "-o", tmp_path / "v", "--yes"])
+    assert "3 of the plan's 3 poses" in process.communicate(timeout=60)[1]
+
+
+def test_ctrl_c_at_a_terminal_pauses_and_the_same_process_goes_on(small: SmallCell, tmp_path: Path) -> None:
+    cell, plan = real_time_cell(small, tmp_path, 6.0, 0.05)
+    ours, theirs = pty.openpty()
+    process = started([cell, plan, "-o", tmp_path / "s", "--yes", "--json"], stdin=theirs, stderr=theirs)
+    os.close(theirs)
+    shown = read_until(ours, b"predicted place")
+    process.send_signal(signal.SIGINT)
+    shown += read_until(ours, b"q ends the run:")
+    assert b"pauses after this shot" in shown
+    os.write(ours, b"r")
+    read_until(ours, None)
+    out, _ = process.communicate(timeout=60)
+    os.close(ours)
+    assert process.returncode == 0
+    assert json.loads(out)["n_shots"] == N_POSES
+    assert sum(shot.replaces is not None for shot in read_session(tmp_path / "s").all_shots) == 1
 
 
 def read_until(descriptor: int, words: bytes | None) -> bytes:

@@ -15,6 +15,7 @@ from calibrate import Calibration
 from drivers.errors import LinkLost, RobotTimeout
 from drivers.files.session import read_scan, read_session
 from measure.running import capture_session
+from tests.support.driven import mark_driven
 from tests.support.fake_ur import FakeUr, fake_ur, own_address
 from tests.support.ur_cell import write_cells
 from tests.system.conftest import Cli
@@ -51,6 +52,7 @@ def test_the_whole_way_gives_what_the_plain_simulated_robot_gives(cells: tuple[P
             own = tmp_path / f"{purpose}_{name}.yaml"
             own.write_text(plan.read_text().replace(_digest(wired), _digest(cell)))
             out = tmp_path / f"{purpose}_{name}"
+            mark_driven(cell, own)
             controller.bench.ask("home")
             result = cli("capture", cell, own, "-o", out, "--yes", "--json")
             assert result.code == 0, result.err
@@ -101,6 +103,7 @@ def test_a_run_whose_link_was_cut_is_gone_on_with(cells: tuple[Path, Path], cont
     controller.clear()
     before = controller.n_motions()
     assert len(read_session(out).shots) == 1
+    mark_driven(wired, plan)
     told = cli("capture", wired, plan, "-o", out, "--yes", "--resume", "--json").told
     assert (told["n_shots"], told["state"]) == (3, "complete")
     assert controller.n_motions() >= before + 2
