@@ -31,10 +31,11 @@ _BUILT_IN: dict[str, dict[str, str]] = {
         "simulated": "drivers.simulated:make_camera",
         "recorded": "drivers.recorded:make_camera",
         "folder": "drivers.cameras.folder:make_camera",
+        "genicam": "drivers.cameras.genicam:make_camera",
     },
 }
 
-NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder"})
+NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder", "genicam"})
 """Drivers without a signed hardware log in docs/; every report says so."""
 
 

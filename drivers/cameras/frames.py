@@ -34,7 +34,7 @@ def frame_problems(xyz_mm: FloatImage) -> list[str]:
     if middle < 0:
         return [f"the points lie behind the camera (median depth {middle:.0f} mm): its z axis looks the other way. Set its axes."]
     if middle < METRES_BELOW_MM:
-        return [f"the median depth is {middle:.3f} mm: are these metres? Set the camera, or the unit of its files."]
+        return [f"the median depth is {middle:.3f} mm, as if these were metres. Set the camera, or the unit of its files, to mm."]
     return _mirror_problems(points, np.column_stack([columns, rows]).astype(np.float64)) if min(xyz_mm.shape[:2]) > 1 else []
 
 

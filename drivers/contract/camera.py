@@ -25,7 +25,7 @@ from drivers.protocols import CONNECT_S, Camera3D, Frame3D
 __all__ = ["CameraContract", "CameraRig"]
 
 _METRES_BELOW_MM = 10.0
-_TRIES = 20
+_TRIES = 10
 _OVER_S = 0.5
 
 
