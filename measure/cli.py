@@ -27,6 +27,7 @@ from measure.cli_run import run_app
 from measure.cli_serve import serve_cell
 from measure.cli_solve import calibrate, centres
 from measure.cli_study import study
+from measure.cli_teach import teach
 from measure.console import Console
 
 app = typer.Typer(
@@ -46,6 +47,7 @@ app.command("doctor")(doctor)
 app.command("plan")(plan)
 app.command("predict")(predict)
 app.command("capture")(capture)
+app.command("teach")(teach)
 app.command("import")(import_session)
 app.command("centres")(centres)
 app.command("calibrate")(calibrate)
