@@ -23,6 +23,7 @@ from calibrate.export_hand_eye import (
     ur_pose,
     urdf_camera_joint,
 )
+from calibrate.export_notes import require_hand_eye
 from calibrate.export_residual import Residual
 from calibrate.export_tables import mdh_csv, mdh_full_csv, ur_kinematics_yaml
 from calibrate.export_target_files import Target
@@ -48,7 +49,11 @@ class Exported:
 
 
 def _hand_eye(writer: Callable[[Calibration], str]) -> Writer:
-    return lambda calibration: (writer(calibration), None)
+    def write(calibration: Calibration) -> tuple[str, Residual | None]:
+        require_hand_eye(calibration)
+        return writer(calibration), None
+
+    return write
 
 
 def _mdh(calibration: Calibration) -> tuple[str, Residual]:
@@ -94,8 +99,8 @@ def export_text(
         targets_file: where they came from, for messages.
 
     Raises:
-        SettingsError: an unknown format, targets missing or not wanted, a pose-only calibration asked for its robot, or a robot that
-            the format does not fit.
+        SettingsError: an unknown format, targets missing or not wanted, a pose-only calibration asked for its robot, one of the
+            robot alone for its hand-eye, or a robot that the format does not fit.
         DataError: a target that the corrected robot does not reach.
     """
     if file_format not in FORMATS:

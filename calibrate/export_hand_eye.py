@@ -10,7 +10,7 @@ import json
 import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
 
-from calibrate.export_notes import MM_PER_M, commented, nominal_robot_note, number, numbers, provenance, roll_pitch_yaw_rad
+from calibrate.export_notes import MM_PER_M, commented, hand_eye_notes, nominal_robot_note, number, numbers, provenance, roll_pitch_yaw_rad
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
@@ -31,7 +31,8 @@ def hand_eye_data(calibration: Calibration) -> dict[str, object]:
         "verdict": calibration.verdict,
         "unit": "mm",
         "frame": FRAME,
-        "note": nominal_robot_note(calibration),
+        "hand_eye": calibration.hand_eye,
+        "note": "; ".join((*hand_eye_notes(calibration), nominal_robot_note(calibration))),
         "flange_from_camera": transform.tolist(),
         "translation_mm": dict(zip("xyz", transform[:3, 3].tolist(), strict=True)),
         "quaternion": dict(zip(_QUATERNION_NAMES, quaternion.tolist(), strict=True)),

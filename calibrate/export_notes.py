@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 MM_PER_M = 1000.0
 _MOST_CORNERS = 1024
+_NOT_CALIBRATED = {
+    "cell": "NOT calibrated, for no sphere was seen: it is the cell file's own",
+    "none": "unknown, for no sphere was seen: this is of the robot alone",
+}
 
 
 def provenance(calibration: Calibration, *, unit: str, frame: str) -> tuple[str, ...]:
@@ -32,6 +36,7 @@ def provenance(calibration: Calibration, *, unit: str, frame: str) -> tuple[str,
         f"unit: {unit}",
         f"frame: {frame}",
         f"base: {_base_text(calibration)}",
+        *hand_eye_notes(calibration),
     )
     return tuple(one_line(line) for line in lines)
 
@@ -78,6 +83,24 @@ def robot_of(calibration: Calibration, what: str) -> RobotModel:
             remedy="Export the hand-eye (hand-eye-yaml, ur-pose, rapid-tooldata, ...), or calibrate sessions that hold joints_rad.",
         )
     return calibration.model
+
+
+def hand_eye_notes(calibration: Calibration) -> tuple[str, ...]:
+    """What is to be said of a hand-eye that was not calibrated; nothing where it was."""
+    return (f"hand-eye: {_NOT_CALIBRATED[calibration.hand_eye]}",) if calibration.hand_eye in _NOT_CALIBRATED else ()
+
+
+def require_hand_eye(calibration: Calibration) -> None:
+    """See that a calibration knows where its camera sits: one of external points alone may not, and its identity is a placeholder.
+
+    Raises:
+        SettingsError: it does not.
+    """
+    if calibration.hand_eye == "none":
+        raise SettingsError(
+            "this calibration is of the robot alone: nothing is known of where its camera sits",
+            remedy="Export the robot (urdf, mdh, targets-csv, ...), or calibrate on shots of spheres too.",
+        )
 
 
 def seen_joints_rad(calibration: Calibration, n: int, *, seed: int = 0) -> FloatArray:

@@ -74,7 +74,7 @@ def ur_kinematics_yaml(calibration: Calibration) -> tuple[str, Residual]:
         "spherecal": {
             "calibration": calibration.id,
             "tool0_from_flange": _xyz_rpy(chain.origins[-1]),
-            "tool0_from_camera": _xyz_rpy(chain.origins[-1] @ calibration.flange_from_camera),
+            "tool0_from_camera": None if calibration.hand_eye == "none" else _xyz_rpy(chain.origins[-1] @ calibration.flange_from_camera),
             "dh_convention": "RotZ(q + theta) TransZ(d) TransX(a) RotX(alpha); m, rad; corrected minus nominal",
             **_dh_deltas(model, table),
             "dh_residual": table.residual.text(),

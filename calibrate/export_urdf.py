@@ -40,7 +40,8 @@ def urdf_robot(calibration: Calibration, joint_names: Sequence[str] | None = Non
     chain = rigid_chain(calibration, "URDF")
     names = tuple(joint_names or (f"joint_{i + 1}" for i in range(chain.model.n_joints)))
     robot = ET.Element("robot", name=one_line(chain.model.name))
-    frame = "links from `base` to `flange`, joints as the controller reports them; `camera` hangs on the flange"
+    frame = "links from `base` to `flange`, joints as the controller reports them"
+    frame += "; `camera` hangs on the flange" if calibration.hand_eye != "none" else "; no camera"
     for line in (*provenance(calibration, unit="m, rad", frame=frame), chain.text(), *_remarks(chain.model, names)):
         add_comment(robot, line)
     ET.SubElement(robot, "link", name=BASE)
@@ -48,7 +49,8 @@ def urdf_robot(calibration: Calibration, joint_names: Sequence[str] | None = Non
     for i in range(chain.model.n_joints):
         parent = _add_axis(robot, chain, i, parent, names)
     add_fixed_joint(robot, chain.origins[-1], parent, FLANGE)
-    add_fixed_joint(robot, calibration.flange_from_camera, FLANGE, CAMERA)
+    if calibration.hand_eye != "none":
+        add_fixed_joint(robot, calibration.flange_from_camera, FLANGE, CAMERA)
     return xml_text(robot), chain.residual
 
 

@@ -34,6 +34,8 @@ class Evidence:
     """Rms of held-out external points; None without any."""
     shortcomings: tuple[str, ...] = ()
     """What the shots are too few or too alike in, with what to do."""
+    ignores_lengths: bool = False
+    """Whether the method takes no certified length, even where one was seen."""
     unseen_branch: UnseenBranch | None = None
     """The best known of the arm's other branches where all shots are of one."""
 
@@ -102,7 +104,8 @@ def _doubts(e: Evidence) -> list[str]:
         where = "over the work volume" if e.over_work_volume else "between sphere places"
         found.append(f"a length {where} has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm")
     if e.has_joints and not e.has_certified_length:
-        found.append("no certified length was seen: the scale over the volume rests on sphere diameters and depth alone")
+        lacking = "the method stepwise uses no certified length" if e.ignores_lengths else "no certified length was seen"
+        found.append(f"{lacking}: the scale over the volume rests on sphere diameters and depth alone")
     if _MANY_REJECTED < 1 - e.used / max(e.n_shots, 1) <= _TOO_MANY_REJECTED:
         found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
     if e.has_joints and e.covariance_scale > 4.0:

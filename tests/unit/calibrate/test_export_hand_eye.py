@@ -6,6 +6,7 @@ import csv
 import json
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calibrate import Calibration
 from calibrate.export import HAND_EYE_FORMATS, export_text
+from drivers.errors import SettingsError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from tests.support.exporting import assert_same_poses, calibration_of, shipped_calibration
@@ -141,3 +143,20 @@ def test_the_note_tells_what_the_nominal_robot_would_cost() -> None:
     assert said_mm == pytest.approx(np.sqrt((off[:, :3, 3] ** 2).sum(axis=1).mean()), rel=0.2)
     assert "flange poses that the controller reports" in export_text(calibration_of(None), "hand-eye-csv").text
     assert se3.is_rigid(calibration.flange_from_camera)
+
+
+@pytest.mark.parametrize("name", HAND_EYE_FORMATS)
+def test_a_hand_eye_that_nobody_knows_is_refused_and_one_of_the_cell_file_says_so(name: str) -> None:
+    """Of external points alone the file holds the identity as a placeholder: nobody may take it for a tool."""
+    of_robot = shipped_calibration("ur5e")
+    with pytest.raises(SettingsError, match="of the robot alone"):
+        export_text(replace(of_robot, hand_eye="none"), name)
+    assert "NOT calibrated" in export_text(replace(of_robot, hand_eye="cell"), name).text
+    assert "NOT calibrated" not in export_text(of_robot, name).text
+
+
+def test_a_robot_whose_camera_nobody_knows_is_exported_without_one() -> None:
+    of_robot = replace(shipped_calibration("ur5e"), hand_eye="none")
+    assert 'link name="camera"' not in export_text(of_robot, "urdf").text
+    data: Any = load_plain_yaml(export_text(of_robot, "ur-kinematics").text)
+    assert data["spherecal"]["tool0_from_camera"] is None
