@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +13,8 @@ import typer
 from measure.cli_run import EXIT_INTERRUPTED, EXIT_NOT_GOOD, AsJson, Debug, Quiet, command, stopped_by_signals
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from acquire.capture import CaptureSettings
     from acquire.cell import Cell
     from acquire.events import Command, Event
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
     from measure.console import Console
     from measure.running import CaptureResult
     from measure.running_operator import Interrupts
+    from measure.running_screen import Screen
 
 MOTION_WORD = "move"
 
@@ -34,6 +38,15 @@ class How:
     """A person lets the robot go to every single pose."""
     note: str = ""
     """Why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Extras:
+    """What watches a run from outside."""
+
+    until_length_u_mm: float | None = None
+    extend: int = 0
+    view: bool = False
 
 
 def capture(
@@ -50,6 +63,14 @@ def capture(
         float | None, typer.Option(min=0.001, metavar="RAD_S", help="No axis faster than this; never faster than the cell says.")
     ] = None,
     warm_up: Annotated[bool, typer.Option("--warm-up", help="First let the camera run until it drifts no more.")] = False,
+    until_length_u: Annotated[
+        float | None,
+        typer.Option(min=0.001, metavar="MM", help="End early when lengths over the work volume are predicted this well, expanded (k = 2)."),
+    ] = None,
+    extend: Annotated[
+        int, typer.Option(min=0, metavar="N", help="With --until-length-u: up to N further best next poses, while it is not reached.")
+    ] = 0,
+    view: Annotated[bool, typer.Option("--view", help="Show the run in Rerun, on this machine only.")] = False,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -65,10 +86,11 @@ def capture(
         if dry_run:
             run.finish(_dry_run(run.console, loaded, poses, settings))
             return
+        _check_extend(loaded, until_length_u, extend)
         how = how_to_run(loaded, poses, settings, yes=yes, step=step)
         if how.note:
             run.console.note(how.note)
-        result, interrupts = _captured(run, loaded, poses, out, how, resume=resume)
+        result, interrupts = _captured(run, loaded, poses, out, how, Extras(until_length_u, extend, view), resume=resume)
         run.console.say(f"{result.n_shots} shots in {out}, {result.n_failed} failed, {result.n_skipped} skipped: {result.state}")
         if result.state == "stopped":
             run.console.note(f"go on with: spherecal capture {cell} {plan} -o {out} --resume")
@@ -85,7 +107,17 @@ def _settings(cell: Cell, speed_rad_s: float | None, warm_up: bool) -> CaptureSe
     return replace(settings, motion=motion, warm_up=WarmUpSettings() if warm_up else None)
 
 
-def _captured(run: Run, cell: Cell, plan: Plan, out: Path, how: How, *, resume: bool) -> tuple[CaptureResult, Interrupts]:
+def _check_extend(cell: Cell, until_length_u_mm: float | None, extend: int) -> None:
+    from drivers.errors import SettingsError
+    from measure.running import moves_a_real_robot
+
+    if extend and until_length_u_mm is None:
+        raise SettingsError("further poses are taken until something is reached", where="--extend", remedy="Give --until-length-u MM too.")
+    if extend and moves_a_real_robot(cell):
+        _require_person("--extend goes where nobody has driven before")
+
+
+def _captured(run: Run, cell: Cell, plan: Plan, out: Path, how: How, extras: Extras, *, resume: bool) -> tuple[CaptureResult, Interrupts]:
     from acquire.cell import robot_model_of
     from measure.running import capture_session, moves_a_real_robot
     from measure.running_coverage import Coverage
@@ -93,20 +125,46 @@ def _captured(run: Run, cell: Cell, plan: Plan, out: Path, how: How, *, resume: 
     from measure.running_operator import Interrupts, Operator
     from measure.running_screen import Screen
 
-    real = moves_a_real_robot(cell)
-    with run.console.live() as draw, Keyboard.opened() as keys:
+    real, model = moves_a_real_robot(cell), robot_model_of(cell)
+    with run.console.live() as draw, Keyboard.opened() as keys, ExitStack() as stack:
         attended = keys is not None and (real or how.step)
-        screen = Screen(run.console.note, run.console.error, draw, Coverage(robot_model_of(cell), _view(cell)), keys=attended)
+        screen = Screen(run.console.note, run.console.error, draw, Coverage(model, _view(cell)), keys=attended)
         interrupts = Interrupts(screen.tell, attended=attended)
-        operator = Operator(keys if attended else None, interrupts, screen.prompt, step=how.step)
+        operator = Operator(keys if attended else None, interrupts, screen.prompt, step=how.step, planned=[pose.id for pose in plan.poses])
+        look = stack.enter_context(_viewer(cell, extras.view))
+        advice = stack.enter_context(_advice(plan, out, extras, screen, watched=draw is not None and real))
 
         def watch(event: Event) -> Command | None:
             screen.show(event)
-            return operator.command_at(event)
+            look(event)
+            advised = advice(event)
+            return operator.command_at(event) or advised
 
         with stopped_by_signals(), interrupts.watching():
             result = capture_session(cell, plan, out, watcher=watch, resume=resume, settings=how.settings, stepped=how.step)
     return result, interrupts
+
+
+@contextmanager
+def _viewer(cell: Cell, wanted: bool) -> Iterator[Callable[[Event], None]]:
+    from acquire.cell import robot_model_of
+    from measure.running_view import viewed
+
+    with viewed(cell, robot_model_of(cell) if wanted else None) as show:
+        yield show
+
+
+@contextmanager
+def _advice(plan: Plan, out: Path, extras: Extras, screen: Screen, *, watched: bool) -> Iterator[Callable[[Event], Command | None]]:
+    """The running solve of a calibration, where somebody sees it or it is to end the run."""
+    from measure.running_advice import Advice, Wanted
+    from measure.running_solve import SolveWorker
+
+    if plan.purpose != "calibration" or not (watched or extras.until_length_u_mm is not None):
+        yield lambda _: None
+        return
+    with SolveWorker() as solver:
+        yield Advice(solver, out, plan, Wanted(extras.until_length_u_mm, extras.extend), screen.solved).command_at
 
 
 def _view(cell: Cell) -> CameraView | None:

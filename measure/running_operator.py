@@ -6,7 +6,7 @@ Nobody at a terminal: Ctrl-C once ends the run after the shot in hand, and whate
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 
@@ -47,10 +47,13 @@ class Interrupts:
 
 
 class Operator:
-    """Answers events."""
+    """Answers events. Poses that are not planned are asked about in any mode: nobody has driven there before."""
 
-    def __init__(self, keys: Keyboard | None, interrupts: Interrupts, prompt: Callable[[str | None], None], *, step: bool) -> None:
+    def __init__(
+        self, keys: Keyboard | None, interrupts: Interrupts, prompt: Callable[[str | None], None], *, step: bool, planned: Collection[str] = ()
+    ) -> None:
         self._keys, self._interrupts, self._prompt, self._step = keys, interrupts, prompt, step
+        self._planned = frozenset(planned)
         self._pause = self._end = False
 
     def command_at(self, event: Event) -> Command | None:
@@ -64,7 +67,7 @@ class Operator:
             return pressed
         if isinstance(event, _STANDING) and (self._pause or self._end or self._interrupts.asked):
             return self._at_rest()
-        if isinstance(event, PoseStarted) and self._step:
+        if isinstance(event, PoseStarted) and self._keys is not None and (self._step or event.pose.id not in self._planned):
             answer = self._ask(f"pose {event.pose.id}: Enter goes there, s skips it, r redoes the last, q ends the run:")
             return None if isinstance(answer, Continue) else answer
         return None

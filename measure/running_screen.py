@@ -108,7 +108,10 @@ class Screen:
 
     def _left(self, n_left: int) -> str:
         taken = self._n_begun - 1
-        return f", about {(time.monotonic() - self._began) / taken * n_left / 60:.0f} min left" if taken else ""
+        if not taken:
+            return ""
+        seconds = (time.monotonic() - self._began) / taken * n_left
+        return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"
 
     def _redraw(self) -> None:
         if self._draw is not None:

@@ -60,6 +60,27 @@ def write_recording(path: str | Path, scene: Scene) -> Path:
     return target
 
 
+class LiveRecording:
+    """A viewer that is shown one step after the other. Nothing here waits for it longer than rerun does."""
+
+    def __init__(self, url: str, scene: Scene) -> None:
+        import rerun as rr
+
+        self._scene, self._number = scene, 0
+        self._stream = rr.RecordingStream("spherecal")
+        self._stream.connect_grpc(url, default_blueprint=_layout(scene))
+        _log_static(self._stream, scene)
+
+    def show(self, step: Step, *, is_new: bool) -> None:
+        """Show a step; as the next of the timeline, or as the robot under way to it."""
+        self._number += is_new
+        self._stream.set_time(TIMELINE, sequence=self._number)
+        if is_new:
+            _log_step(self._stream, self._scene, step)
+        else:
+            _log_robot(self._stream, self._scene, step)
+
+
 def _stream_to(path: Path, scene: Scene) -> rr.RecordingStream:
     import rerun as rr
 

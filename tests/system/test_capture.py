@@ -16,10 +16,13 @@ from typing import Any
 import pytest
 
 from acquire.cell import load_cell
+from acquire.events import Finish, PoseStarted
 from acquire.plan import Plan, PlannedPose, load_plan, write_plan
 from drivers.files.session import read_session
 from drivers.files.yaml import dump_yaml, parse_yaml
+from measure.running import capture_session
 from measure.running_record import RunRecord, read_runs
+from measure.running_solve import Question, solve_so_far
 from tests.support.driven import mark_driven
 from tests.system.conftest import Cli, SmallCell
 
@@ -246,6 +249,29 @@ def test_ctrl_c_at_a_terminal_pauses_and_the_same_process_goes_on(small: SmallCe
     assert process.returncode == 0
     assert json.loads(out)["n_shots"] == N_POSES
     assert sum(shot.replaces is not None for shot in read_session(tmp_path / "s").all_shots) == 1
+
+
+def test_a_run_goes_beyond_its_plan_until_enough_is_known(small: SmallCell, tmp_path: Path, cli: Cli) -> None:
+    plan = load_plan(small.folder / "calibration_plan.yaml")
+    write_plan(type(plan)(plan.cell_sha256, plan.purpose, plan.poses[:20]), tmp_path / "plan.yaml")
+    options = ("--yes", "--json", "--until-length-u", 0.001, "--extend", 1)
+    result = cli("capture", small.cell, tmp_path / "plan.yaml", "-o", tmp_path / "s", *options)
+    assert (result.code, result.told["n_shots"], result.told["state"]) == (0, 21, "complete")
+    session = read_session(tmp_path / "s")
+    assert str(session.shots[-1].pose_id).startswith("extra")
+    solved = solve_so_far(Question(tmp_path / "s", plan.poses))
+    assert solved.trouble is None
+    assert solved.best in {pose.id for pose in plan.poses[20:]}
+    assert solved.length_u_mm is not None
+    # what a later calibration of the same shots with more of them is predicted to be is better
+    more = solve_so_far(Question(small.calibration_session, ()))
+    assert more.length_u_mm is not None
+    assert more.length_u_mm < solved.length_u_mm
+    # when it is enough the pose in hand is finished, and the run is done
+    cell = load_cell(small.cell)
+    enough = capture_session(cell, plan, tmp_path / "u", watcher=lambda event: Finish() if isinstance(event, PoseStarted) else None)
+    assert (enough.state, enough.n_shots) == ("enough", 1)
+    assert cli("capture", small.cell, tmp_path / "plan.yaml", "-o", tmp_path / "t", "--yes", "--extend", 1).code == 1
 
 
 def read_until(descriptor: int, words: bytes | None) -> bytes:

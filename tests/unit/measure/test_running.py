@@ -101,7 +101,7 @@ def told(*_: object) -> None:
 
 def test_keys_become_commands_when_they_can_be_obeyed(terminal: Terminal) -> None:
     with Keyboard.opened(terminal.stream) as keys:
-        operator = Operator(keys, Interrupts(told, attended=True), told, step=False)
+        operator = Operator(keys, Interrupts(told, attended=True), told, step=False, planned=[POSE.id])
         moving = Moving("p0", None, 0.1)
         assert operator.command_at(moving) is None
         terminal.types("s")
@@ -127,7 +127,7 @@ def test_step_mode_asks_and_hasty_keys_answer_nothing(key: str, command: object,
             if question is not None:
                 terminal.types("x" + key)
 
-        operator = Operator(keys, Interrupts(told, attended=True), prompt, step=True)
+        operator = Operator(keys, Interrupts(told, attended=True), prompt, step=True, planned=[POSE.id])
         terminal.types("\n\n\n")
         assert operator.command_at(STARTED) == command
         assert questions[1:] == [None]
