@@ -7,6 +7,7 @@ against one hand-eye transform: that of the shots that are clear, or, where too 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -93,7 +94,9 @@ def look_again(
 ) -> Observations:
     """The observations, with shots taken back or corrected that the first look refused or mistook.
 
-    Nothing changes where the first look refused none and all its shots agree, nor where no agreement is found.
+    Nothing changes where the first look refused none and all its shots agree. Where no agreement is found and a wrong
+    expectation kept the first look from half of the shots, scans with one sphere of the size come back as they are, so that
+    what is wrong with the poses can be found out.
 
     Raises:
         FileError: a scan is missing, cut off or changed.
@@ -112,7 +115,7 @@ def look_again(
     if hand_eye is None:
         hand_eye = consensus_hand_eye(candidates, np.random.default_rng(_SEED))
     if hand_eye is None:
-        return first
+        return _with_lone(looker, first, sights)
     places = name_places(candidates, names, hand_eye, cell)
     return _merged(first, _found(looker, sights, candidates.in_base_mm(hand_eye), doubtful, hand_eye, places))
 
@@ -165,6 +168,14 @@ def _found(
     unseen = (doubtful | {sight.key for sight in sights}) - set(nearest)
     again = {key: looker.near(key, flange_from_camera, places) for key in sorted(unseen)}
     return found | {key: shot for key, shot in again.items() if shot is not None}
+
+
+def _with_lone(looker: _Looker, first: Observations, sights: Sequence[_Sight]) -> Observations:
+    if 2 * len(first.shots) >= first.n_shots - len(first.external):
+        return first
+    count = Counter(sight.key for sight in sights)
+    lone = {sight.key: looker.taken(sight) for sight in sights if count[sight.key] == 1 and sight.finding is not None}
+    return _merged(first, lone) if lone else first
 
 
 def _merged(first: Observations, found: Mapping[_Key, SphereShot]) -> Observations:

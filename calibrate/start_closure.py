@@ -98,7 +98,8 @@ def refine_closure(base_from_flange: FloatArray, centres_in_camera_mm: FloatArra
         columns = (flat - member @ _means(flat, weight, member)).reshape(*miss.shape, 3, 6)
         weighted = np.swapaxes(columns * weight[..., None, None], 2, 3)
         normal = (weighted @ columns).sum(axis=1)
-        normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        # a floor of its own: a sphere that one shot alone shows gives no column at all
+        normal += (1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(6)
         step = -np.linalg.solve(normal, (weighted @ difference[..., None]).sum(axis=1))[..., 0]
         hand_eye = se3.exp(step / [1, 1, 1, _LEVER_MM, _LEVER_MM, _LEVER_MM]) @ hand_eye
     return Closure(hand_eye, places, miss)
