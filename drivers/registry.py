@@ -32,10 +32,14 @@ _BUILT_IN: dict[str, dict[str, str]] = {
         "recorded": "drivers.recorded:make_camera",
         "folder": "drivers.cameras.folder:make_camera",
         "genicam": "drivers.cameras.genicam:make_camera",
+        "realsense": "drivers.cameras.realsense:make_camera",
+        "mech_eye": "drivers.cameras.mech_eye:make_camera",
+        "photoneo": "drivers.cameras.photoneo:make_camera",
+        "zivid": "drivers.cameras.zivid:make_camera",
     },
 }
 
-NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder", "genicam"})
+NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder", "genicam", "realsense", "mech_eye", "photoneo", "zivid"})
 """Drivers without a signed hardware log in docs/; every report says so."""
 
 
