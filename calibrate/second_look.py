@@ -173,8 +173,8 @@ def _found(
 def _with_lone(looker: _Looker, first: Observations, sights: Sequence[_Sight]) -> Observations:
     if 2 * len(first.shots) >= first.n_shots - len(first.external):
         return first
-    count = Counter(sight.key for sight in sights)
-    lone = {sight.key: looker.taken(sight) for sight in sights if count[sight.key] == 1 and sight.finding is not None}
+    refused, count = {(r.session, r.index) for r in first.rejected}, Counter(sight.key for sight in sights)
+    lone = {sight.key: looker.taken(sight) for sight in sights if sight.key in refused and count[sight.key] == 1}
     return _merged(first, lone) if lone else first
 
 
