@@ -16,13 +16,13 @@ from drivers.errors import SpherecalError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.models import load_robot_model, shipped_models
-from drivers.protocols import Camera3D, Frame3D, Mode, Robot, RobotState
+from drivers.protocols import Camera3D, Mode, Robot, RobotState
+from measure.doctor_camera import camera_hints, frame_facts, identity_problems, info_facts
 
 Facts: TypeAlias = dict[str, object]
 
 FACTORY_CALIBRATED_MM = 20.0
 FACTORY_CALIBRATED_RAD = 0.0175
-METRES_BELOW_MM = 10.0
 FRAME_TIMEOUT_S = 10.0
 
 
@@ -198,21 +198,7 @@ def examine_camera(camera: Camera3D, cell: Cell, diagnosis: Diagnosis) -> None:
         diagnosis.problems.append(f"camera: {error}")
         return
     facts, problems = frame_facts(frame, cell.camera.working_range_mm)
-    diagnosis.camera.update(facts, ok=not problems, serial=info.serial, firmware=info.firmware)
+    problems = [*identity_problems(info, cell.identity, cell.camera.kind), *problems]
+    diagnosis.camera.update(info_facts(info) | facts, ok=not problems)
     diagnosis.problems.extend(f"camera: {problem}" for problem in problems)
-
-
-def frame_facts(frame: Frame3D, working_range_mm: tuple[float, float] | None) -> tuple[Facts, list[str]]:
-    """Size, valid points and depths of a frame, and what is wrong with them."""
-    height, width, _ = frame.xyz_mm.shape
-    depth_mm = frame.xyz_mm[..., 2][np.isfinite(frame.xyz_mm).all(axis=-1)]
-    facts: Facts = {"width": width, "height": height, "n_points": int(depth_mm.size), "depth_mm": None}
-    if depth_mm.size == 0:
-        return facts, []  # a camera that looks into the air is well: nothing is in its range
-    low, middle, high = (float(value) for value in np.percentile(depth_mm, (1, 50, 99)))
-    facts["depth_mm"] = [low, middle, high]
-    if middle < METRES_BELOW_MM:
-        return facts, [f"the median depth is {middle:.3f}: metres? Set the camera to mm."]
-    if working_range_mm is not None and not working_range_mm[0] / 2 <= middle <= working_range_mm[1] * 2:
-        return facts, [f"the median depth is {middle:.0f} mm, the cell's working range {working_range_mm[0]:g} to {working_range_mm[1]:g} mm."]
-    return facts, []
+    diagnosis.hints.extend(f"camera: {hint}" for hint in camera_hints(info, frame))

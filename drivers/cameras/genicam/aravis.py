@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from ctypes import byref, c_int, c_size_t, c_uint64
 from ipaddress import IPv4Address
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from drivers.errors import CameraBusy, CameraError, CameraLost, CameraMisconfigu
 
 _N_BUFFERS = 4
 _SUCCESS = 0
+_RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
+_WANTED_BUFFER = 8 * 1024 * 1024
 _STATUS = {1: "is empty", 2: "lacks packets", 3: "lacks packets", 4: "has packets out of order", 5: "does not fit its buffer", 7: "was aborted"}
 _REMEDY = "Check cable, power and address; see that the camera answers `ping`."
 
@@ -63,7 +66,8 @@ class AravisTransport:
         except BaseException:
             self.close()
             raise
-        return DeviceIdentity(vendor, model, serial, firmware or self.get("DeviceVersion"), f"Aravis {library.version}")
+        version = firmware or self.get("DeviceVersion")
+        return DeviceIdentity(vendor, model, serial, version, f"Aravis {library.version}", network_notes(_RMEM_MAX))
 
     def get(self, feature: str) -> str | None:
         """The value of a feature as text."""
@@ -154,7 +158,13 @@ class AravisTransport:
         completed, failures, underruns = c_uint64(), c_uint64(), c_uint64()
         self._call("arv_gv_stream_get_statistics", self._stream, byref(resent), byref(missing))
         self._call("arv_stream_get_statistics", self._stream, byref(completed), byref(failures), byref(underruns))
-        return {"packets_resent": resent.value, "packets_missing": missing.value, "frames_failed": failures.value, "frames_dropped": underruns.value}
+        return {
+            "packet_size": int(self._ask("arv_gv_device_get_packet_size", self._device)),
+            "packets_resent": resent.value,
+            "packets_missing": missing.value,
+            "frames_failed": failures.value,
+            "frames_dropped": underruns.value,
+        }
 
     def close(self) -> None:
         """Give up control."""
@@ -230,6 +240,21 @@ class AravisTransport:
             self._lost = True
             remedy = "Close the other client, and open the camera anew."
             raise CameraLost(f"control over the camera at {self._address} is lost", remedy=remedy) from error
+
+
+def network_notes(rmem_max: Path) -> tuple[str, ...]:
+    """What a Linux computer's network settings hold against large frames.
+
+    Args:
+        rmem_max: the kernel's file of the largest socket buffer; other systems have none.
+    """
+    try:
+        size = int(rmem_max.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return ()
+    if size >= _WANTED_BUFFER:
+        return ()
+    return (f"socket buffers may be {size // 1024} KiB at most, so packets may be lost: sysctl -w net.core.rmem_max={_WANTED_BUFFER}",)
 
 
 def local_address(address: str) -> str:

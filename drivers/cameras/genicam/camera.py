@@ -150,6 +150,7 @@ class GenicamCamera:
             onboard_correction=said.onboard_correction,
             vendor=who.vendor,
             sdk_version=who.library,
+            notes=who.notes,
         )
 
     def _capture(self, timeout_s: float) -> Frame3D:

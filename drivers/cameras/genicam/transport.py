@@ -30,6 +30,8 @@ class DeviceIdentity:
     serial: str | None
     firmware: str | None
     library: str
+    notes: tuple[str, ...] = ()
+    """What an operator should know of the way to the camera."""
 
 
 class Transport(Protocol):

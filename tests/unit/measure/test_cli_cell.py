@@ -21,7 +21,8 @@ from measure.cell_text import CellAnswers, cell_text
 from measure.cli import app
 from measure.cli_run import run_app
 from measure.demo_cell import write_demo_cell
-from measure.doctor import frame_facts, robot_problems
+from measure.doctor import robot_problems
+from measure.doctor_camera import frame_facts
 
 
 def parsed(text: str) -> Cell:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.cameras.genicam import make_camera
-from drivers.cameras.genicam.aravis import AravisTransport, local_address
+from drivers.cameras.genicam.aravis import AravisTransport, local_address, network_notes
 from drivers.cameras.genicam.camera import GenicamCamera
 from drivers.contract.camera import CameraContract, CameraRig
 from drivers.contract.camera_rig import opened_camera
@@ -198,3 +198,13 @@ def test_calls_on_a_closed_transport_are_errors() -> None:
             call()
     assert transport.drain() == 0
     assert transport.fetch(0.01) is None
+
+
+def test_a_small_socket_buffer_is_told(tmp_path: Path) -> None:
+    setting = tmp_path / "rmem_max"
+    assert network_notes(setting) == ()
+    setting.write_text("212992\n", encoding="ascii")
+    (note,) = network_notes(setting)
+    assert "208 KiB" in note
+    setting.write_text("16777216\n", encoding="ascii")
+    assert network_notes(setting) == ()
