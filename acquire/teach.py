@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from acquire.motion import MotionSettings, Stillness, halt, move, read_safely, s
 from acquire.plan import PlannedPose
 from acquire.sighting import base_from_flange_of, look_for, predicted_centre_in_camera_mm
 from acquire.sphere import ArcFinding, SphereFinding, SphereNotFound, SphereSettings
+from acquire.sweep import way_between
 from acquire.teach_events import Finish, Guide, Jog, Looked, NextSphere, Record, Recorded, Taught, TeachCommand, TeachEvent, Told, Via
 from drivers.errors import CameraTimeout, InvalidFrame, MotionRefused, SafetyStop, SettingsError
 from drivers.kinematics.mdh import RobotModel, within_limits
@@ -32,7 +32,6 @@ from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import Devices, HandGuided, RobotState
 
 _ALIKE_RAD = np.radians(4.0)
-_WAY_STEP_RAD = np.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,9 +242,7 @@ class _Lesson:
         """Whether the straight lines in axis angles from the pose before, which a run drives, touch something known."""
         if self._blocked is None or not self._poses:
             return False
-        points = [self._poses[-1].joints_rad, *pose.via_rad, pose.joints_rad]
-        ways = [_between(first, second) for first, second in pairwise(points)]
-        return bool(self._blocked(np.concatenate(ways)).any())
+        return bool(self._blocked(way_between(self._poses[-1], pose)).any())
 
     def _undo(self) -> TeachEvent:
         if self._via:
@@ -282,9 +279,3 @@ class _Lesson:
             halt(self._robot, self._settings.motion)
             raise
         return Told(f"axis {axis + 1} at {np.degrees(target[axis]):.2f} degrees")
-
-
-def _between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Axis angles (k, n) on the straight way, ends included."""
-    n_steps = max(1, int(np.ceil(np.abs(second - first).max() / _WAY_STEP_RAD)))
-    return np.asarray(first + np.linspace(0, 1, n_steps + 1)[:, None] * (second - first))

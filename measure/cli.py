@@ -22,6 +22,7 @@ from measure.cli_import import import_session
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
 from measure.cli_predict import predict
+from measure.cli_preview import preview
 from measure.cli_report import report, show
 from measure.cli_run import run_app
 from measure.cli_serve import serve_cell
@@ -45,6 +46,7 @@ app.command("demo")(demo)
 app.add_typer(new, name="new")
 app.command("doctor")(doctor)
 app.command("plan")(plan)
+app.command("preview")(preview)
 app.command("predict")(predict)
 app.command("capture")(capture)
 app.command("teach")(teach)

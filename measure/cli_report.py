@@ -68,7 +68,7 @@ def show(
         record(out, loaded, [read_session(folder) for folder in sessions])
         run.console.say(f"{out} written; look at it with: {viewer_command(out)}")
         if view:
-            _open_viewer(out)
+            open_viewer(out)
         run.finish({"out": out})
 
 
@@ -110,7 +110,12 @@ def record(out: Path, calibration: Calibration, sessions: list[Session]) -> None
     write_recording(out, scene)
 
 
-def _open_viewer(path: Path) -> None:
+def open_viewer(path: Path) -> None:
+    """Start the viewer on a recording, for this computer alone, and go on.
+
+    Raises:
+        SettingsError: it cannot be started.
+    """
     import subprocess
     import sys
 

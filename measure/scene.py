@@ -53,6 +53,28 @@ class SphereMark:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SolidMark:
+    """Something that stands in the cell."""
+
+    name: str
+    vertices_in_base_mm: FloatArray
+    """(n, 3)."""
+    triangles: NDArray[np.int64]
+    """(m, 3) rows of the vertices."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathMark:
+    """The way of one point of the arm."""
+
+    name: str
+    points_in_base_mm: FloatArray
+    """(n, 3)."""
+    touches: NDArray[np.bool_]
+    """(n,) where the arm touches something."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """Everything of one recording."""
 
@@ -69,3 +91,5 @@ class Scene:
     """Where the camera's image plane is drawn."""
     stitched_in_base_mm: FloatArray | None = None
     """(n, 3) the fused cloud of a workpiece."""
+    solids: tuple[SolidMark, ...] = ()
+    paths: tuple[PathMark, ...] = ()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from drivers.errors import FileError
 from drivers.kinematics.mdh import Capsule
 from measure.scene import Scene, SphereCloud, SphereMark, Step
+from measure.viewer_surroundings import log_surroundings
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -111,6 +112,7 @@ def _log_static(stream: rr.RecordingStream, scene: Scene) -> None:
         stream.log("base/stitched", _points(scene.stitched_in_base_mm, STITCHED_COLOUR, 10 * _POINTS_OF_ALL_STEPS), static=True)
     for capsule_link, capsules in _by_link(scene.shape).items():
         stream.log(f"base/robot/link{capsule_link}/body", _bodies(capsules), static=True)
+    log_surroundings(stream, scene)
     for name, colour in _curve_colours(scene).items():
         stream.log(f"curves/{_entity(name)}", rr.SeriesLines(colors=colour, names=name, widths=1.5), static=True)
         stream.log(f"curves/{_entity(name)}", rr.SeriesPoints(colors=colour, names=name, marker_sizes=3.0), static=True)
@@ -277,8 +279,9 @@ def _layout(scene: Scene) -> Any:
     close = [_close_view(scene, sphere) for sphere in scene.spheres if _sides(sphere)]
     curves = rrb.TimeSeriesView(origin="curves", name="residuals in mm over the poses", plot_legend=rrb.PlotLegend(corner="RightTop"))
     log = rrb.TextLogView(origin="texts/shot", name="shots")
-    right: list[Any] = [rrb.Tabs(*texts, log), *([rrb.Tabs(*close)] if close else []), curves]
-    shares = [2.0, *([2.2] if close else []), 1.6]
+    has_curves = not scene.steps or any(step.curves for step in scene.steps)
+    right: list[Any] = [rrb.Tabs(*texts, log), *([rrb.Tabs(*close)] if close else []), *([curves] if has_curves else [])]
+    shares = [2.0, *([2.2] if close else []), *([1.6] if has_curves else [])]
     columns = rrb.Horizontal(cell, rrb.Vertical(*right, row_shares=shares), column_shares=[1.5, 1.0])
     return rrb.Blueprint(
         columns,
