@@ -45,6 +45,11 @@ def warming_up(devices: Devices, settings: WarmUpSettings, *, frame_timeout_s: f
         yield event
         if event.warm:
             return
+        if now_s - begin_s > 2 * settings.window_s and event.drift_k_per_min is None and event.drift_mm_per_min is None:
+            raise CameraTimeout(
+                "nothing tells whether the camera is warm: it gives no temperature and sees nothing from here",
+                remedy="Put something into its view, move the robot to where it sees something, or go on without --warm-up.",
+            )
         if now_s - begin_s > settings.longest_s:
             raise CameraTimeout(
                 f"the camera still drifts after {settings.longest_s / 60:.0f} min: {drift_text(event)}",

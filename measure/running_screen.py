@@ -95,7 +95,7 @@ class Screen:
         self._redraw()
 
     def _suspended(self, text: str) -> None:
-        if self._state != "PAUSED" or text != self._remark:
+        if self._has_keys:  # otherwise nobody answers, and the run ends with this error
             self.tell(text)
 
     def _finish(self, event: e.Captured | e.Failed | e.Skipped) -> None:

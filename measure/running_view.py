@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,12 +97,17 @@ class View:
             points = event.xyz_mm.reshape(-1, 3).astype(np.float64)
             points = points[np.isfinite(points).all(axis=1)]
             points = points[:: max(1, -(-len(points) // _POINTS))]
-            self._feed.offer(Glimpse(self._step(np.asarray(event.shot.joints_rad), points, event.pose_id), is_new=True))
+            self._feed.offer(Glimpse(self._step(np.asarray(event.shot.joints_rad), points, event.pose_id, _curves(event)), is_new=True))
 
-    def _step(self, joints_rad: FloatArray, points_in_camera_mm: FloatArray, pose_id: str) -> Step:
+    def _step(self, joints_rad: FloatArray, points_in_camera_mm: FloatArray, pose_id: str, curves: Mapping[str, float] | None = None) -> Step:
         links = np.asarray(mdh.chain(self._model, joints_rad))
         base_from_camera = links[-1] @ self._flange_from_camera
-        return Step(f"pose {pose_id}", links, base_from_camera, se3.apply(base_from_camera, points_in_camera_mm), np.zeros((0, 3)))
+        return Step(f"pose {pose_id}", links, base_from_camera, se3.apply(base_from_camera, points_in_camera_mm), np.zeros((0, 3)), curves or {})
+
+
+def _curves(event: Captured) -> dict[str, float]:
+    found = {} if event.finding is None else {"rms of the sphere fit": event.finding.rms_mm}
+    return found if event.prediction_error_mm is None else found | {"distance from the predicted place": event.prediction_error_mm}
 
 
 @contextmanager

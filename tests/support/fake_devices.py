@@ -113,6 +113,7 @@ class FakeCamera:
         self.before: Callable[[], object] = lambda: None
         self.warms_k_per_frame = 0.0
         self.temperature_c = 31.5
+        self.tells_temperature = True
 
     def open(self) -> CameraInfo:
         return CameraInfo("fake")
@@ -124,7 +125,7 @@ class FakeCamera:
         if fault is not None:
             raise fault
         self.sequence += 1
-        temperatures_c = {"housing": self.temperature_c}
+        temperatures_c = {"housing": self.temperature_c} if self.tells_temperature else {}
         self.temperature_c += self.warms_k_per_frame
         return Frame3D(xyz_mm=self.xyz_mm.copy(), sequence=self.sequence, time_s=0.0, temperatures_c=temperatures_c)
 

@@ -267,3 +267,11 @@ def test_a_warm_up_can_be_paused_skipped_and_given_up(bench: Bench) -> None:
     events = bench.run(fake_plan(2), clearing(bench), settings)
     assert [event.cause for event in suspended(events)] == [Cause.CAMERA]
     assert pose_ids(events) == ["p1"]
+
+
+def test_a_camera_that_tells_nothing_cannot_be_warmed_up(bench: Bench) -> None:
+    bench.camera.xyz_mm = np.full_like(bench.camera.xyz_mm, np.nan)
+    bench.camera.tells_temperature = False
+    with pytest.raises(CameraTimeout, match="nothing tells"):
+        bench.run(fake_plan(1), capture=CaptureSettings(warm_up=WARM))
+    assert bench.robot.clock_s < 200

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquire.events import Append, Event, Finish, PoseStarted, Skipped
+from acquire.cell import load_cell, robot_model_of
+from acquire.events import Append, Captured, Event, Finish, Moving, PoseStarted, Skipped
 from acquire.plan import PlannedPose
 from drivers.files.shots import Shot
+from drivers.kinematics.mdh import base_from_flange
+from measure.demo_cell import write_demo_cell
 from measure.running_advice import Advice, Wanted
 from measure.running_solve import FEWEST_SHOTS, Question, Solved, SolveWorker, straight_way
-from measure.running_view import Feed
+from measure.running_view import Feed, View, scene_of_run
 from tests.support.fake_devices import fake_plan
 
 PLAN = fake_plan(3)
@@ -139,3 +142,29 @@ def test_a_viewer_that_hangs_delays_nothing() -> None:
         assert time.monotonic() - began < 10.0
         before = time.monotonic()
     assert time.monotonic() - before < 10.0
+
+
+def test_a_view_shows_the_nominal_robot_and_what_its_camera_sees(tmp_path: Path) -> None:
+    cell = load_cell(write_demo_cell(tmp_path, 1))
+    model = robot_model_of(cell)
+    assert model is not None
+    shown: list[Any] = []
+
+    class Kept(Feed):
+        def offer(self, item: object) -> None:
+            shown.append(item)
+
+    view = View(Kept(hang), cell, model)
+    joints = np.array([0.1, 0.2, 0.1, 0.0, 0.5, 0.0])
+    view.show(Moving("p0", joints, 0.1))
+    view.show(Moving("p0", joints, 0.1))
+    shot = Shot(index=0, sphere="A", joints_rad=joints, base_from_flange=None, scan=None, sha256=None, time_utc="")
+    xyz = np.full((3, 4, 3), np.nan, dtype=np.float32)
+    xyz[1, 2] = (1, 2, 300)
+    view.show(Captured("p0", shot, xyz, None, 1.5))
+    assert [glimpse.is_new for glimpse in shown] == [False, True], "readings that come too fast are left out"
+    step = shown[1].step
+    base_from_camera = base_from_flange(model, joints) @ np.asarray(cell.flange_from_camera)
+    np.testing.assert_allclose(step.before_in_base_mm, [base_from_camera[:3, :3] @ [1, 2, 300] + base_from_camera[:3, 3]], atol=1e-4)
+    assert step.curves == {"distance from the predicted place": 1.5}
+    assert {mark.name for mark in scene_of_run(cell, model).spheres} == set(cell.spheres)
