@@ -6,17 +6,30 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-WIDTH, HEIGHT = 160, 120
-FOCAL_PX = 700.0
-PRINCIPAL_PX = (79.5, 59.5)
 UNIT_M = 1e-5
 PERIOD_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """Size and lines of sight of a depth stream; pixels."""
+
+    width: int = 160
+    height: int = 120
+    focal_x: float = 700.0
+    focal_y: float = 700.0
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Where the optical axis meets the image."""
+        return (self.width - 1) / 2, (self.height - 1) / 2
 
 
 def depth_image(points: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -24,19 +37,23 @@ def depth_image(points: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.rint(np.nan_to_num(points[..., 2]) / (1000 * UNIT_M)).astype(np.uint16)
 
 
-def lines_of_sight() -> NDArray[np.float64]:
-    """Unit lines of sight (height, width, 3) of the device's pinhole."""
-    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
-    slopes = np.stack([(columns - PRINCIPAL_PX[0]) / FOCAL_PX, (rows - PRINCIPAL_PX[1]) / FOCAL_PX, np.ones((HEIGHT, WIDTH))], axis=-1)
+def lines_of_sight(pinhole: Pinhole) -> NDArray[np.float64]:
+    """Unit lines of sight (height, width, 3)."""
+    columns, rows = np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height))
+    across, down = (columns - pinhole.middle[0]) / pinhole.focal_x, (rows - pinhole.middle[1]) / pinhole.focal_y
+    slopes = np.stack([across, down, np.ones(across.shape)], axis=-1)
     return np.asarray(slopes / np.linalg.norm(slopes, axis=-1, keepdims=True))
 
 
 class FakeRealsense:
     """Streams what `expose` gives at each moment: points (height, width, 3) on `lines_of_sight`, in mm."""
 
-    def __init__(self, expose: Callable[[], NDArray[np.float32]], *, unit_m: float = UNIT_M, distortion: float = 0.0) -> None:
+    def __init__(
+        self, expose: Callable[[], NDArray[np.float32]], pinhole: Pinhole | None = None, *, unit_m: float = UNIT_M, distortion: float = 0.0
+    ) -> None:
         self.rs: Any = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed: pip install 'spherecal[realsense]'")
         self.expose = expose
+        self._pinhole = pinhole or Pinhole()
         self.silent = False
         self.device = self.rs.software_device()
         self.device.register_info(self.rs.camera_info.serial_number, "SW1")
@@ -58,7 +75,7 @@ class FakeRealsense:
         depth = depth_image(self.expose())
         self._number += 1
         frame = self.rs.software_video_frame()
-        frame.pixels, frame.stride, frame.bpp = depth, 2 * WIDTH, 2
+        frame.pixels, frame.stride, frame.bpp = depth, 2 * depth.shape[1], 2
         frame.timestamp, frame.domain = 1000.0 * time.monotonic(), self.rs.timestamp_domain.hardware_clock
         frame.frame_number, frame.profile, frame.depth_units = self._number, self._profile, UNIT_M
         self._sensor.on_video_frame(frame)
@@ -80,11 +97,11 @@ class FakeRealsense:
                 self.send()
 
     def _stream(self, distortion: float) -> Any:
-        pinhole = self.rs.intrinsics()
-        pinhole.width, pinhole.height, pinhole.fx, pinhole.fy = WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX
-        pinhole.ppx, pinhole.ppy, pinhole.coeffs = *PRINCIPAL_PX, [distortion, 0, 0, 0, 0]
-        pinhole.model = self.rs.distortion.brown_conrady
+        size, found = self._pinhole, self.rs.intrinsics()
+        found.width, found.height, found.fx, found.fy = size.width, size.height, size.focal_x, size.focal_y
+        found.ppx, found.ppy, found.coeffs = *size.middle, [distortion, 0, 0, 0, 0]
+        found.model = self.rs.distortion.brown_conrady
         stream = self.rs.video_stream()
         stream.type, stream.index, stream.uid, stream.fmt = self.rs.stream.depth, 0, 1, self.rs.format.z16
-        stream.width, stream.height, stream.fps, stream.bpp, stream.intrinsics = WIDTH, HEIGHT, int(1 / PERIOD_S), 2, pinhole
+        stream.width, stream.height, stream.fps, stream.bpp, stream.intrinsics = size.width, size.height, int(1 / PERIOD_S), 2, found
         return stream

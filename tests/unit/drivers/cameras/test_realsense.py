@@ -16,11 +16,12 @@ from drivers.contract.camera import CameraContract, CameraRig
 from drivers.contract.camera_rig import require_sphere
 from drivers.errors import CameraError, CameraMisconfigured, CameraNotReached, SettingsError
 from drivers.registry import DriverContext
-from tests.support.fake_realsense import HEIGHT, UNIT_M, WIDTH, FakeRealsense, lines_of_sight
+from tests.support.fake_realsense import UNIT_M, FakeRealsense, Pinhole, lines_of_sight
 from tests.support.scan_scene import RADIUS_MM, ScanScene
 from tests.support.scenes import frame
 
-SIGHT = lines_of_sight()
+SIGHT = lines_of_sight(Pinhole())
+HEIGHT, WIDTH = SIGHT.shape[:2]
 
 
 class Scene(ScanScene):
