@@ -101,7 +101,9 @@ def calibrate(
     sessions: SessionFolders,
     out: Annotated[Path, typer.Option("--out", "-o", help="The calibration to write.")] = Path("calibration.yaml"),
     method: Annotated[Method, typer.Option(help="The solver.")] = Method.clouds,
-    camera_error: Annotated[CameraErrorChoice, typer.Option("--camera-error", help="Model of the camera's error.")] = CameraErrorChoice.auto,
+    camera_error: Annotated[
+        CameraErrorChoice, typer.Option("--camera-error", metavar="MODEL", help=f"Of the camera's error: {', '.join(CameraErrorChoice)}.")
+    ] = CameraErrorChoice.auto,
     robot_terms: Annotated[
         ArmTerms, typer.Option("--robot-terms", help="Terms of the arm beyond link twists: those that held-out shots want, or none.")
     ] = ArmTerms.auto,
