@@ -202,12 +202,12 @@ def how_to_run(cell: Cell, plan: Plan, settings: CaptureSettings, *, yes: bool, 
 
     left = _never_driven(cell, plan, settings)
     if left:
-        what = f"{len(left)} of the plan's {len(plan.poses)} poses were never driven step by step in this cell"
+        what = f"{len(left)} of the plan's {len(plan.poses)} poses were never driven in this cell step by step"
         if yes or not sys.stdin.isatty():
             remedy = "Run it once at a terminal, without --yes: it asks before every pose and moves slowly. --yes is for plans that were driven so."
             raise SettingsError(what, file=cell.path, remedy=remedy)
         slow = replace(settings, motion=replace(settings.motion, speed_rad_s=_first_speed(settings)))
-        return How(slow, step=True, note=f"{what}: step by step at {slow.motion.speed_rad_s:g} rad/s\n{NO_SAFETY}")
+        return How(slow, step=True, note=f"{what}:\nfirst run, step by step at {slow.motion.speed_rad_s:g} rad/s\n{NO_SAFETY}")
     if step:
         _require_person("--step asks before every pose")
     elif not yes:
