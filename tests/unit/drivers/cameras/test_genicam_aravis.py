@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.cameras.genicam import make_camera
+from drivers.cameras.genicam import aravis, aravis_library, make_camera
 from drivers.cameras.genicam.aravis import AravisTransport, local_address, network_notes
 from drivers.cameras.genicam.camera import GenicamCamera
 from drivers.contract.camera import CameraContract, CameraRig
 from drivers.contract.camera_rig import opened_camera
-from drivers.errors import CameraError, CameraLost, CameraMisconfigured, CameraNotReached, SettingsError
+from drivers.errors import CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, SettingsError
 from drivers.registry import DriverContext
 from tests.support.fake_gige import ADDRESS, FakeGige, fake_gige
 from tests.support.scan_scene import RADIUS_MM, ScanScene
@@ -187,9 +187,10 @@ def test_settings_are_checked(settings: dict[str, object], said: str) -> None:
         make_camera(DriverContext(settings, None, Path()))
 
 
-def test_calls_on_a_closed_transport_are_errors() -> None:
+def test_calls_on_a_closed_transport_are_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     transport = AravisTransport(ADDRESS)
     transport.close()
+    monkeypatch.setattr(aravis, "load", lambda: None)  # asked before the library is needed
     with pytest.raises(CameraNotReached, match="Connection refused"):
         AravisTransport("127.0.0.78").open()
     calls: list[Callable[[], object]] = [lambda: transport.get("Width"), lambda: transport.execute("TriggerSoftware"), transport.start]
@@ -208,3 +209,10 @@ def test_a_small_socket_buffer_is_told(tmp_path: Path) -> None:
     assert "208 KiB" in note
     setting.write_text("16777216\n", encoding="ascii")
     assert network_notes(setting) == ()
+
+
+def test_without_the_library_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aravis_library, "NAMES", ("libnowhere.so.0",))
+    with pytest.raises(CameraSdkMissing, match="not installed") as caught:
+        camera_of().open()
+    assert "libaravis-0.8-0" in str(caught.value.remedy)
