@@ -34,7 +34,7 @@ class Pinhole:
 
 def depth_image(points: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Depths of a scan in steps of the unit, 0 for holes."""
-    return np.rint(np.nan_to_num(points[..., 2]) / (1000 * UNIT_M)).astype(np.uint16)
+    return np.asarray(np.rint(np.nan_to_num(points[..., 2]) / (1000 * UNIT_M)), dtype=np.uint16)
 
 
 def lines_of_sight(pinhole: Pinhole) -> NDArray[np.float64]:

@@ -29,6 +29,7 @@ from drivers.errors import (
     RobotTimeout,
     SafeguardStop,
     SafetyStop,
+    SpherecalError,
     StaleReading,
 )
 from drivers.models import load_robot_model
@@ -58,7 +59,7 @@ def stands(controller: FakeUr) -> bool:
     return axes.clock_s >= axes.start_s + axes.duration_s
 
 
-def first_error(action: Callable[[], object], *kinds: type[RobotError]) -> RobotError:
+def first_error(action: Callable[[], object], *kinds: type[RobotError]) -> SpherecalError:
     """Repeat until it fails, which has to be soon."""
 
     def repeat() -> None:
