@@ -32,6 +32,10 @@ _SLOWEST_RATE = 0.02
 _NEAR_MM = 0.05
 """Steps below which the robust loss is curved upwards nearly everywhere: Newton steps are then safe."""
 _MAX_PASSES = 40
+_WANDERS_AFTER, _WANDERS_MM = 3, 5.0
+_HOLD, _HOLD_LONGER, _MORE_PASSES = 10.0, 12, 20
+"""Shots that leave directions open (all from one place) let a solve wander along them. It is then begun again with every unknown
+held where it is by so many times the precision of its physical size, later by ten times that: determined ones hardly feel it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +52,8 @@ class Solution:
     point_rms_mm: FloatArray
     """(m,) rms radial residual of each shot with its pose noise taken out."""
     passes: int
+    held: bool = False
+    """Whether unknowns had to be held back: what is left open by the shots stands near its first guess."""
 
     @property
     def covariance(self) -> FloatArray:
@@ -97,9 +103,21 @@ def thinned(problem: Problem, n_points: int) -> Problem:
 
 
 def _descend(problem: Problem, state: State, noise: NoiseModel, n_estimates: int, tolerance_mm: float) -> Solution:
+    """Descend freely; where that wanders off or does not settle, once more from the start with every unknown held back."""
+    for hold in (0.0, _HOLD):
+        found = _passes(problem, state, noise, n_estimates, tolerance_mm, hold)
+        if found is not None:
+            return found
+    raise DataError(
+        f"the solve did not settle in {_MAX_PASSES} passes",
+        remedy="Check that the robot model, the spheres and the scans belong together; `spherecal centres` shows each shot.",
+    )
+
+
+def _passes(problem: Problem, state: State, noise: NoiseModel, n_estimates: int, tolerance_mm: float, hold: float) -> Solution | None:
     """Gauss-Newton, Newton in the robust loss; the noise model is estimated in the first passes and held afterwards."""
-    rough, step_mm = n_estimates == _FIRST_ESTIMATES, np.inf
-    for passes in range(1, _MAX_PASSES + 1):
+    rough, step_mm, physical = n_estimates == _FIRST_ESTIMATES, np.inf, normal.physical_precision(problem)
+    for passes in range(1, _MAX_PASSES + (_MORE_PASSES if hold else 0) + 1):
         geometry, rows = linearise_geometry(problem, state), external_rows(problem, state)
         # held only once the state stands: what the noise model is must not depend on where the solve began
         estimating = passes <= n_estimates or (0 < n_estimates < passes <= n_estimates + _MORE_ESTIMATES and step_mm > _STANDS_MM)
@@ -108,21 +126,21 @@ def _descend(problem: Problem, state: State, noise: NoiseModel, n_estimates: int
         if estimating:
             sweeps = None if first else _FIRST_SWEEPS if rough and passes == 2 else 0
             noise = _estimate_noise(problem, state, geometry, sums, rows, noise, sweeps=sweeps)
-        near = step_mm < _NEAR_MM
+        damping = hold * 10.0 ** (passes // _HOLD_LONGER) * physical if hold else None
+        near = step_mm < _NEAR_MM and not hold
         curved = _sums_of_all(problem, state, geometry, sums, sums.curved_moments if near else sums.moments, rows, noise)
-        step, noise_step = normal.solve_step(curved, normal.reduce(curved, noise.pose_precision))
+        step, noise_step = normal.solve_step(curved, normal.reduce(curved, noise.pose_precision), damping)
         step[problem.layout.terms] *= problem.free_terms  # the prior that holds the others leaves 1e-20 of them
         previous_mm, step_mm = step_mm, _size_mm(geometry, rows, step)
         if not estimating and _settled(step_mm, previous_mm, passes, tolerance_mm):
             linearised = _sums_of_all(problem, state, geometry, sums, sums.moments, rows, noise)
             reduced = normal.reduce(linearised, noise.pose_precision)
             state = state.moved(problem.layout, step, noise_step)
-            return Solution(problem, state, noise, linearised, reduced, geometry, sums.moments, sums.point_rms_mm, passes)
+            return Solution(problem, state, noise, linearised, reduced, geometry, sums.moments, sums.point_rms_mm, passes, hold > 0.0)
+        if passes > _WANDERS_AFTER and step_mm > _WANDERS_MM and not hold:
+            return None
         state = state.moved(problem.layout, step, noise_step)
-    raise DataError(
-        f"the solve did not settle in {_MAX_PASSES} passes (last step {step_mm:.2g} mm)",
-        remedy="Check that the robot model, the spheres and the scans belong together; `spherecal centres` shows each shot.",
-    )
+    return None
 
 
 def _settled(step_mm: float, previous_mm: float, passes: int, tolerance_mm: float) -> bool:

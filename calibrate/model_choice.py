@@ -123,7 +123,9 @@ def _best_variant(family: Sequence[CameraError], folds: Folds, stacked: StackedM
 
 def _squared(miss_mm: FloatArray) -> FloatArray:
     squared = (miss_mm**2).sum(axis=1)
-    return np.asarray(squared[np.isfinite(squared)])
+    finite = np.isfinite(squared)
+    # where no shot is left out from which others could tell (all of one pose) nothing speaks for more than the simplest model
+    return np.asarray(squared[finite]) if finite.any() else np.full(2, np.nan)
 
 
 def _cap(errors_mm2: Sequence[FloatArray]) -> float:

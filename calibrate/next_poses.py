@@ -54,7 +54,9 @@ def shortcomings(problem: Problem, solution: Solution, expected_rank: int) -> tu
     found = []
     n_sought = expected_rank + 3 * len(problem.radius_mm) - len(problem.lengths)
     if 3 * problem.n_shots < n_sought:
-        found.append(f"too few shots: {problem.n_shots} for {n_sought} unknowns, each tells three numbers; take {_ENOUGH_SHOTS} or more")
+        found.append(
+            f"too few shots: {problem.n_shots} for {n_sought} unknowns, each tells three numbers; take {max(_ENOUGH_SHOTS, n_sought)} or more"
+        )
     if not problem.n_shots:
         return tuple(found)
     seen = solution.geometry.centre_in_camera_mm

@@ -148,9 +148,10 @@ def reduce(linearised: Linearised, pose_precision: FloatArray, scan_weight: Floa
     return Reduced(hessian, gradient, inverse, noise_gradient, log_determinant, cost)
 
 
-def solve_step(linearised: Linearised, reduced: Reduced) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton step of the unknowns (P,) and of the nuisances (G, 6)."""
-    step = -symmetric_solve(reduced.hessian, reduced.gradient)
+def solve_step(linearised: Linearised, reduced: Reduced, damping: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton step of the unknowns (P,) and of the nuisances (G, 6), with a precision (P,) that holds unknowns where they are."""
+    hessian = reduced.hessian if damping is None else reduced.hessian + np.diag(damping)
+    step = -symmetric_solve(hessian, reduced.gradient)
     right = reduced.noise_gradient + linearised.cross @ step
     return step, -(reduced.noise_inverse @ right[..., None])[..., 0]
 
@@ -205,6 +206,19 @@ def _lengths(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, fl
         gradient += row * residual
         cost += residual**2
     return hessian, gradient, cost
+
+
+def physical_precision(problem: Problem) -> FloatArray:
+    """(P,) inverse variances of the size that unknowns may physically have, centres and a hand-eye without first guess included."""
+    layout, priors = problem.layout, problem.priors
+    precision = np.full(layout.size, priors.hand_eye_mm**-2)
+    precision[layout.links] = np.tile([priors.link_rho_mm**-2] * 3 + [priors.link_phi_rad**-2] * 3, layout.n_links)
+    precision[layout.hand_eye] = [priors.hand_eye_mm**-2] * 3 + [priors.hand_eye_rad**-2] * 3
+    precision[layout.camera] = problem.camera_error.prior_sigma_mm**-2.0
+    precision[layout.terms] = priors.term_sigma_rad(problem.terms) ** -2.0
+    precision[layout.radius_offset] = priors.radius_offset_mm**-2
+    precision[layout.sphere_radius] = problem.radius_sigma_mm**-2.0
+    return precision
 
 
 def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:

@@ -134,6 +134,7 @@ def make_result(
         has_joints=has_joints,
         # a laser tracker's points are lengths in themselves
         has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
+        held=solution.held,
         ignores_lengths=method == "stepwise",
         line_profile=line_profile,
         covariance_scale=scale,

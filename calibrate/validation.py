@@ -39,8 +39,8 @@ class Prediction:
 
     @property
     def centre_rms_mm(self) -> float:
-        """Root of the mean squared distance of the shots' centres from their sphere's."""
-        return float(np.sqrt((self.centre_error_mm**2).sum(axis=1).mean()))
+        """Root of the mean squared distance of the shots' centres from their sphere's; NaN without any shot."""
+        return np.nan if not len(self.centre_error_mm) else float(np.sqrt((self.centre_error_mm**2).sum(axis=1).mean()))
 
     @property
     def radial_rms_mm(self) -> float:

@@ -34,6 +34,8 @@ class Evidence:
     """Rms of held-out external points; None without any."""
     shortcomings: tuple[str, ...] = ()
     """What the shots are too few or too alike in, with what to do."""
+    held: bool = False
+    """Whether the solve came to rest only with its unknowns held back."""
     ignores_lengths: bool = False
     """Whether the method takes no certified length, even where one was seen."""
     unseen_branch: UnseenBranch | None = None
@@ -81,6 +83,8 @@ def _grave(e: Evidence, identifiability: Identifiability) -> list[str]:
             f"the shots hold the arm in one branch: measured with the {e.unseen_branch.text}, which the robot can, a place would be off by up to "
             f"U = {e.unseen_branch.expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm: take a third of the shots so"
         )
+    if e.held:
+        found.append("the shots determine so little that the solve came to rest only with its unknowns held near the first guess")
     rejected = 1 - e.used / max(e.n_shots, 1)
     if rejected > _TOO_MANY_REJECTED:
         found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +14,17 @@ from calibrate.clouds import Solution, solve_clouds
 from calibrate.identifiability import Identifiability, identifiability_of, parameter_names, parameter_scale
 from calibrate.normal import NoiseModel, linearise, reduce
 from calibrate.problem import Problem, State, linearise_geometry
+from calibrate.solve import calibrate
 from calibrate.sums import shot_moments
 from calibrate.verdict import Evidence, judge
+from drivers.files.session import read_session
 from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from tests.support.bound import FIRST_NOISE
 from tests.support.solving import bent_state, draw_shots, problem_of, start_of
 from tests.support.synthetic import SyntheticCell, draw_view, paper_cell
+from tests.support.synthetic_session import write_session
 
 Gauge = Callable[[RobotModel, State, FloatArray], State]
 
@@ -175,3 +179,25 @@ def test_names_and_scales_go_with_the_layout(pose_only: bool) -> None:
     scale = parameter_scale(problem.layout)
     assert len(scale) == problem.layout.camera.stop
     assert all((s > 1) == name.endswith("_rad") for s, name in zip(scale, names[: len(scale)], strict=True))
+
+
+def _one_place(rng: np.random.Generator, depth_mm: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Orientations at random, the sphere within a millimetre of one place in the camera frame."""
+    return np.array([5.0, -3.0, 330.0]) + rng.normal(0, 0.3, 3), draw_view(rng, depth_mm)[1]
+
+
+@pytest.mark.parametrize("kind", ["one place", "one pose", "two poses"])
+def test_a_degenerate_plan_fails_with_its_reason_whatever_camera_model_is_tried(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free, the solve wanders along what the shots leave open and never ends; `auto` must come to a verdict all the same."""
+    cell, rng = paper_cell(coupled=True), np.random.default_rng(9)
+    if kind == "one place":
+        monkeypatch.setattr("tests.support.synthetic.draw_view", _one_place)
+        shots = draw_shots(cell, rng, 40, n_points=400)
+    else:
+        few = draw_shots(cell, rng, 1 if kind == "one pose" else 2, n_points=400)
+        shots = [replace(shot, points_in_camera_mm=shot.points_in_camera_mm + rng.normal(0, 0.08, (400, 3))) for _ in range(15) for shot in few]
+    folder = write_session(tmp_path / "s", cell, {"A": shots}, flange_from_camera=cell.flange_from_camera)
+    found = calibrate([read_session(folder)])
+    assert found.verdict == "fail", found.reasons
+    assert any("directions open" in reason or "determine so little" in reason for reason in found.reasons), found.reasons
+    assert found.statistics.used + len(found.rejected) == len(shots)

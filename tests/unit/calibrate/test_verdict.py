@@ -29,6 +29,7 @@ OPEN = replace(WHOLE, rank=23)
 FAILS = {
     "open directions": (GOOD, OPEN, "rank 23"),
     "half of the shots": (replace(GOOD, used=30), WHOLE, "30 of 60 shots were rejected"),
+    "held back": (replace(GOOD, held=True), WHOLE, "held near the first guess"),
     "missed limit": (replace(GOOD, cross_validated_rms_mm=0.21), WHOLE, "the limit is 0.2 mm"),
 }
 DOUBTS = {
