@@ -56,6 +56,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         seen_cells=calibration.cells,
         identifiability=calibration.identifiability,
         error_budget=calibration.error_budget,
+        robot_alone=calibration.hand_eye != "calibrated",
         untried_drivers=() if cell is None else tuple(sorted({cell.robot.driver, cell.camera.driver} & NEVER_ON_HARDWARE)),
     )
 
@@ -64,7 +65,8 @@ def _camera_error_text(calibration: Calibration) -> str:
     compared = calibration.statistics.compared
     if not compared:
         return calibration.camera_error.name
-    tried = ", ".join(f"{name} {rms:.3f}" for name, rms in compared.items())
+    # null where too little was left to compare on
+    tried = ", ".join(name if rms is None else f"{name} {rms:.3f}" for name, rms in compared.items())
     return f"{calibration.camera_error.name} (left-out rms, mm: {tried})"
 
 

@@ -63,6 +63,8 @@ class CalibrationFacts:
     error_budget: ErrorBudget | None = None
     untried_drivers: tuple[str, ...] = ()
     """Drivers of the cell that have never run on hardware."""
+    robot_alone: bool = False
+    """Whether external points were all there was: the camera is not calibrated."""
 
 
 @dataclass(frozen=True, slots=True)

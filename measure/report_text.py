@@ -38,6 +38,8 @@ _NEXT = {
     ),
 }
 
+_NEXT_OF_ROBOT = "Export the corrected robot or targets (`spherecal export`). To measure with a camera, calibrate it on shots of spheres too."
+
 
 def headline_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tuple[str, str, str]:
     """Headline, one sentence, and tone."""
@@ -47,7 +49,12 @@ def headline_of(facts: CalibrationFacts, verification: VerifyResult | None) -> t
 
 def next_steps_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tuple[str, ...]:
     """What to do now."""
-    return _NEXT[_verdict(facts, verification)]
+    verdict = _verdict(facts, verification)
+    if verdict == "pass" and facts.robot_alone:
+        return (_NEXT_OF_ROBOT,)
+    if verdict == "not_proven" and verification is not None and verification.limits is not None:
+        return _NEXT[verdict][1:]
+    return _NEXT[verdict]
 
 
 def _verdict(facts: CalibrationFacts, verification: VerifyResult | None) -> str:
@@ -71,6 +78,9 @@ def result_rows(facts: CalibrationFacts, verification: VerifyResult | None) -> t
         return (*_scatter_rows(verification), *_length_rows(verification), *_shape_rows(verification))
     help_text = "Each shot predicted by a solve that never saw it: how far its sphere centre lies from the common one, root mean square."
     limit = _limit(facts.limits, "centre_rms_mm")
+    if facts.robot_alone:
+        help_text = "Each external point predicted by a solve that never saw it: how far it lies from where it was measured, root mean square."
+        return (_row("distance of points left out in turn, rms", help_text, None, facts.cross_validated_rms_mm, limit),)
     return (_row("centre rms, shots left out in turn", help_text, None, facts.cross_validated_rms_mm, limit),)
 
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquire.cell import Cell
+from acquire.cell import Cell, Limits
 from calibrate.result import Calibration
 from drivers.errors import FileError
 from drivers.files.session import Session
 from measure.report import write_page, write_report
 from measure.report_facts import facts_of
-from measure.report_text import remarks_of
+from measure.report_text import next_steps_of, remarks_of
 from measure.verify import verify
 from measure.verify_result import VerifyResult
 from tests.support.recorded import TrueSystem, nominal_calibration, record_session, write_cell
@@ -144,6 +144,26 @@ def test_bare_facts_make_a_page_too(calibration: Calibration, verification: Veri
     assert "Not proven" in text
     assert "no uncalibrated system to compare with" in text
     assert "none" in text
+
+
+def test_a_robot_without_a_camera_is_not_sent_to_verify(calibration: Calibration, tmp_path: Path) -> None:
+    """Of external points alone there is nothing that `verify` could look through, and no picture."""
+    facts = replace(facts_of(calibration), verdict="pass", shots=(), camera_field=None, seen_mm=None, error_budget=None, robot_alone=True)
+    text, _ = read(write_page(tmp_path / "report.html", facts, None))
+    assert "Export the corrected robot" in text
+    assert "spherecal verify" not in text
+    assert "Pictures" not in text
+
+
+def test_limits_are_asked_for_only_where_there_are_none(calibration: Calibration, verification: VerifyResult) -> None:
+    given = replace(verification, verdict="not_proven", limits=Limits(centre_rms_mm=0.2, length_error_mm=0.2, diameter_error_mm=0.1, form_mm=0.3))
+    assert not any("limits" in step for step in next_steps_of(facts_of(calibration), given))
+    assert any("limits" in step for step in next_steps_of(facts_of(calibration), replace(given, limits=None)))
+
+
+def test_models_that_could_not_be_compared_are_named_alone(calibration: Calibration) -> None:
+    statistics = replace(calibration.statistics, compared={"none": None, "pillow": 0.06})  # type: ignore[dict-item]
+    assert "none, pillow 0.060" in facts_of(replace(calibration, statistics=statistics)).camera_error
 
 
 def test_the_same_facts_give_the_same_bytes(calibration: Calibration, tmp_path: Path) -> None:
