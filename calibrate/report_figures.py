@@ -135,6 +135,7 @@ def make_result(
         # a laser tracker's points are lengths in themselves
         has_certified_length=bool(problem.lengths) or bool(np.isfinite(external_rms)),
         held=solution.held,
+        radius_offset_mm=solution.state.radius_offset_mm,
         ignores_lengths=method == "stepwise",
         line_profile=line_profile,
         covariance_scale=scale,

@@ -11,6 +11,8 @@ from calibrate.arm_branches import UnseenBranch
 from calibrate.identifiability import Identifiability
 
 _MANY_REJECTED, _TOO_MANY_REJECTED = 0.1, 0.4
+_LARGE_OFFSET_MM = 0.3
+"""Three times what is believed of an optical radius: it is rather a wrong diameter."""
 _SPREAD = "spread the sphere in depth and across the view, and turn the camera about more axes"
 
 
@@ -36,6 +38,8 @@ class Evidence:
     """What the shots are too few or too alike in, with what to do."""
     held: bool = False
     """Whether the solve came to rest only with its unknowns held back."""
+    radius_offset_mm: float = 0.0
+    """By how much the spheres read larger in radius than certified."""
     ignores_lengths: bool = False
     """Whether the method takes no certified length, even where one was seen."""
     unseen_branch: UnseenBranch | None = None
@@ -110,6 +114,9 @@ def _doubts(e: Evidence) -> list[str]:
     if e.has_joints and not e.has_certified_length:
         lacking = "the method stepwise uses no certified length" if e.ignores_lengths else "no certified length was seen"
         found.append(f"{lacking}: the scale over the volume rests on sphere diameters and depth alone")
+    if abs(e.radius_offset_mm) > _LARGE_OFFSET_MM:
+        more = "larger" if e.radius_offset_mm > 0 else "smaller"
+        found.append(f"the spheres read {abs(e.radius_offset_mm):.2f} mm {more} in radius than certified: check diameter_mm in the cell file")
     if _MANY_REJECTED < 1 - e.used / max(e.n_shots, 1) <= _TOO_MANY_REJECTED:
         found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
     if e.has_joints and e.covariance_scale > 4.0:

@@ -37,6 +37,7 @@ DOUBTS = {
     "pose only": (replace(GOOD, has_joints=False), "uncalibrated"),
     "no length": (replace(GOOD, has_certified_length=False), "no certified length"),
     "unsure length": (replace(GOOD, length_expanded_uncertainty_mm=0.3), "U = 0.300 mm"),
+    "wrong diameter": (replace(GOOD, radius_offset_mm=-0.9), "0.90 mm smaller in radius"),
     "some rejected": (replace(GOOD, used=50), "10 of 60"),
     "more than noise": (replace(GOOD, covariance_scale=9.0), "3.0 times"),
 }
