@@ -102,7 +102,7 @@ def test_a_hundred_kills(small: SmallCell, tmp_path: Path) -> None:
     while n_kills < 100:
         folder = tmp_path / str(n_sessions)
         folder.mkdir()
-        killed, kills = killed_run(small, folder, 1.0, rng, 100 - n_kills)
+        killed, kills = killed_run(small, folder, 3.0, rng, 100 - n_kills)
         check(small, killed, folder)
         shutil.rmtree(folder)
         n_kills, n_sessions = n_kills + kills, n_sessions + 1
