@@ -197,6 +197,7 @@ def how_to_run(cell: Cell, plan: Plan, settings: CaptureSettings, *, yes: bool, 
         SettingsError: nobody is there to answer, or the answer is no.
         FileError: the record of the cell's runs cannot be read.
     """
+    from acquire.cell import devices_of
     from drivers.errors import SettingsError
     from measure.running_screen import NO_SAFETY
 
@@ -204,6 +205,7 @@ def how_to_run(cell: Cell, plan: Plan, settings: CaptureSettings, *, yes: bool, 
     if left:
         what = f"{len(left)} of the plan's {len(plan.poses)} poses were never driven in this cell step by step"
         if yes or not sys.stdin.isatty():
+            devices_of(cell)  # a driver that does not exist is told first: making devices opens nothing
             remedy = "Run it once at a terminal, without --yes: it asks before every pose and moves slowly. --yes is for plans that were driven so."
             raise SettingsError(what, file=cell.path, remedy=remedy)
         slow = replace(settings, motion=replace(settings.motion, speed_rad_s=_first_speed(settings)))
