@@ -90,6 +90,31 @@ def scene_of(
     )
 
 
+def placed_in_cell(cell: Cell, names: Sequence[str]) -> tuple[tuple[PlacedSphere, ...], tuple[PlacedLength, ...]]:
+    """Some of a cell's own spheres as they stand, and the certified lengths between them.
+
+    Raises:
+        SettingsError: an unknown sphere, or one of unknown place.
+    """
+    spheres = []
+    for name in names:
+        if name not in cell.spheres:
+            known = ", ".join(cell.spheres) or "none"
+            raise SettingsError(f"there is no sphere {name!r}", file=cell.path, where="spheres", remedy=f"Spheres of the cell: {known}.")
+        sphere = cell.spheres[name]
+        if sphere.centre_in_base_mm is None:
+            remedy = "Add centre_in_base_mm: [x, y, z], known to a few mm."
+            raise SettingsError("the place of a sphere is not known", file=cell.path, where=f"spheres.{name}", remedy=remedy)
+        spheres.append(PlacedSphere(sphere.centre_in_base_mm, sphere.diameter_mm, sphere.expanded_uncertainty_mm))
+    order = {name: i for i, name in enumerate(names)}
+    lengths = tuple(
+        PlacedLength(order[length.between[0]], order[length.between[1]], length.expanded_uncertainty_mm)
+        for length in cell.lengths
+        if set(length.between) <= set(order)
+    )
+    return tuple(spheres), lengths
+
+
 def scene_of_cell(
     cell: Cell, model: RobotModel, names: Sequence[str], *, expectation: Expectation | None = None, camera_error: str = "field"
 ) -> Scene:
@@ -98,19 +123,7 @@ def scene_of_cell(
     Raises:
         SettingsError: as `scene_of`, or a sphere's place is not known.
     """
-    spheres = []
-    for name in names:
-        sphere = cell.spheres[name]
-        if sphere.centre_in_base_mm is None:
-            remedy = "Add centre_in_base_mm: [x, y, z], known to a few mm."
-            raise SettingsError("the place of a sphere is not known", file=cell.path, where=f"spheres.{name}", remedy=remedy)
-        spheres.append(PlacedSphere(sphere.centre_in_base_mm, sphere.diameter_mm, sphere.expanded_uncertainty_mm))
-    known = {name: i for i, name in enumerate(names)}
-    lengths = [
-        PlacedLength(known[length.between[0]], known[length.between[1]], length.expanded_uncertainty_mm)
-        for length in cell.lengths
-        if set(length.between) <= set(known)
-    ]
+    spheres, lengths = placed_in_cell(cell, names)
     return scene_of(cell, model, spheres, lengths, expectation=expectation, camera_error=camera_error)
 
 

@@ -17,6 +17,7 @@ from calibrate.external_solve import SPARE_ROWS, ExternalSolved, predicted_rms_m
 from calibrate.identifiability import ANGLE_SCALE_MM, parameter_names
 from calibrate.normal import symmetric_inverse
 from calibrate.observations import RejectedShot
+from calibrate.provenance import identity_of, inputs_of
 from calibrate.result import Calibration, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.temperature import temperature_ranges_c
@@ -126,8 +127,8 @@ def robot_alone_result(
         shots=(),
         rejected=rejected,
         cell_name=cell.name,
-        inputs={"sessions": [{"folder": s.folder.name, "digest": s.digest} for s in sessions], "cell_sha256": cell.sha256},
-        identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
+        inputs=inputs_of(cell, sessions),
+        identity=identity_of(cell, sessions),
         created_utc=created_utc,
         software=software,
         temperatures_c=temperature_ranges_c(sessions),

@@ -223,20 +223,18 @@ def physical_precision(problem: Problem) -> FloatArray:
 
 def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Inverse variances (P,) and current values (P,) of the unknowns that have a prior."""
-    layout, priors = problem.layout, problem.priors
-    precision, value = np.zeros(layout.size), np.zeros(layout.size)
-    precision[layout.links] = np.tile([priors.link_rho_mm**-2] * 3 + [priors.link_phi_rad**-2] * 3, layout.n_links)
+    layout, precision = problem.layout, physical_precision(problem)
+    value = np.zeros(layout.size)
+    precision[layout.centres.start :] = 0.0
     value[layout.links] = state.link_twists.ravel()
-    if problem.first_flange_from_camera is not None:
-        precision[layout.hand_eye] = [priors.hand_eye_mm**-2] * 3 + [priors.hand_eye_rad**-2] * 3
+    if problem.first_flange_from_camera is None:
+        precision[layout.hand_eye] = 0.0
+    else:
         value[layout.hand_eye] = se3.log(state.flange_from_camera @ se3.inverse(problem.first_flange_from_camera))
-    precision[layout.camera] = problem.camera_error.prior_sigma_mm**-2.0
     value[layout.camera] = state.camera_mm
     # terms that are not estimated are held by a prior that no data can move
-    precision[layout.terms] = np.where(problem.free_terms, priors.term_sigma_rad(problem.terms) ** -2.0, _HELD_RAD**-2)
+    precision[layout.terms] = np.where(problem.free_terms, precision[layout.terms], _HELD_RAD**-2)
     value[layout.terms] = state.terms_rad
-    precision[layout.radius_offset] = priors.radius_offset_mm**-2
     value[layout.radius_offset] = state.radius_offset_mm
-    precision[layout.sphere_radius] = problem.radius_sigma_mm**-2.0
     value[layout.sphere_radius] = state.sphere_radius_deviation_mm
     return precision, value

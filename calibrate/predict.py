@@ -15,7 +15,7 @@ import numpy as np
 from acquire.cell import Cell
 from acquire.visibility import camera_view
 from calibrate.design import Predicted, choose_shots
-from calibrate.design_cell import PlacedLength, PlacedSphere, aim_of_cell, feasible_views, scene_of, work_box_mm
+from calibrate.design_cell import PlacedLength, PlacedSphere, aim_of_cell, feasible_views, placed_in_cell, scene_of, work_box_mm
 from calibrate.design_shots import Expectation, IntArray, Scene
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics.mdh import RobotModel
@@ -105,23 +105,8 @@ def own_artefact(cell: Cell, names: Sequence[str]) -> Artefact:
     Raises:
         SettingsError: an unknown sphere, or one of unknown place.
     """
-    spheres = []
-    for name in names:
-        if name not in cell.spheres:
-            known = ", ".join(cell.spheres) or "none"
-            raise SettingsError(f"there is no sphere {name!r}", file=cell.path, where="spheres", remedy=f"Spheres of the cell: {known}.")
-        sphere = cell.spheres[name]
-        if sphere.centre_in_base_mm is None:
-            remedy = "Add centre_in_base_mm: [x, y, z], known to a few mm."
-            raise SettingsError("the place of a sphere is not known", file=cell.path, where=f"spheres.{name}", remedy=remedy)
-        spheres.append(PlacedSphere(sphere.centre_in_base_mm, sphere.diameter_mm, sphere.expanded_uncertainty_mm))
-    order = {name: i for i, name in enumerate(names)}
-    lengths = tuple(
-        PlacedLength(order[length.between[0]], order[length.between[1]], length.expanded_uncertainty_mm)
-        for length in cell.lengths
-        if set(length.between) <= set(order)
-    )
-    return Artefact("this cell", f"spheres {', '.join(names)} of the cell, {len(lengths)} certified lengths", tuple(spheres), lengths)
+    spheres, lengths = placed_in_cell(cell, names)
+    return Artefact("this cell", f"spheres {', '.join(names)} of the cell, {len(lengths)} certified lengths", spheres, lengths)
 
 
 def box_of(cell: Cell) -> FloatArray:

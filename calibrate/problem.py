@@ -43,7 +43,6 @@ class Priors:
     transmission_rad: float = 4e-5
     """Amplitude of an axis' transmission error, what the play of gears adds included. Both sizes were set on 172 cells: intervals
     covered 95.6 %, but one cell in twenty was 1.48 times worse than it said."""
-
     estimated_rad: float = 1e-3
     """Of a term that is estimated, because held-out shots want it."""
 

@@ -27,6 +27,7 @@ from calibrate.identifiability import identifiability_of, parameter_names
 from calibrate.next_poses import Taken, next_best_poses, pose_text, shortcomings
 from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
+from calibrate.provenance import identity_of, inputs_of
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.sources import artefact_covariance
@@ -115,8 +116,8 @@ def make_result(
         shots=_shot_results(assembled, solution, trained, solved.held_out, datum.base_from_solver),
         rejected=rejected,
         cell_name=cell.name,
-        inputs={"sessions": [{"folder": s.folder.name, "digest": s.digest} for s in sessions], "cell_sha256": cell.sha256},
-        identity=dict(cell.identity) | {key: value for s in sessions for key, value in s.identity.items()},
+        inputs=inputs_of(cell, sessions),
+        identity=identity_of(cell, sessions),
         created_utc=created_utc,
         software=software,
         temperatures_c=temperature_ranges_c(sessions),

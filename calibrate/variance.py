@@ -78,13 +78,14 @@ def estimate_range_growth(patches: FloatArray, range_mm: FloatArray, noise: Nois
     Shots at nearly the same range do not tell it: a weak belief in none (power 0 +- 1) then decides.
     """
     variance = _within_patches_mm2(patches)
-    x = np.log(range_mm / np.median(range_mm))
+    middle_mm = float(np.median(range_mm))
+    x = np.log(range_mm / middle_mm)
     y = np.log(np.maximum(variance, _SMALLEST_POINT_MM**2)) / 2.0
     y = y - np.median(y)
-    scatter = float(np.median(np.abs(y - np.median(y)))) ** 2 + 1e-12
+    scatter = float(np.median(np.abs(y))) ** 2 + 1e-12
     power = float(np.clip((x @ y) / (x @ x + scatter), 0.0, _HIGHEST_POWER))
-    typical = float(np.sqrt(np.median(variance / (range_mm / np.median(range_mm)) ** (2 * power))))
-    return replace(noise, point_mm=max(typical, _SMALLEST_POINT_MM), range_power=power, range_mm=float(np.median(range_mm)))
+    typical = float(np.sqrt(np.median(variance / (range_mm / middle_mm) ** (2 * power))))
+    return replace(noise, point_mm=max(typical, _SMALLEST_POINT_MM), range_power=power, range_mm=middle_mm)
 
 
 def _within_patches_mm2(patches: FloatArray) -> FloatArray:

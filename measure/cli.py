@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -42,26 +43,32 @@ app = typer.Typer(
 new = typer.Typer(help="Write a new file to start from.", no_args_is_help=True, rich_markup_mode=None)
 new.command("cell")(new_cell)
 
-app.command("demo")(demo)
+VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
+    ("demo", demo, "Go the whole way on a simulated cell."),
+    ("doctor", doctor, "Examine a cell: its files, then robot and camera."),
+    ("plan", plan, "Plan feasible poses and write them as a plan."),
+    ("preview", preview, "Show a plan's poses and the ways between them."),
+    ("predict", predict, "Compare artefacts and numbers of shots beforehand."),
+    ("capture", capture, "Drive the robot through a plan, record a session."),
+    ("teach", teach, "Lead the arm by hand, or jog it, and keep poses."),
+    ("import", import_session, "Make a session from others' poses and clouds."),
+    ("centres", centres, "Find the sphere's centre in every shot."),
+    ("calibrate", calibrate, "Calibrate robot, hand-eye and camera together."),
+    ("verify", verify, "Prove a calibration on shots that it never saw."),
+    ("stitch", stitch, "Put a session's scans into one cloud in the base."),
+    ("report", report, "Write report.html: the calibration and its proof."),
+    ("show", show, "Write a Rerun recording of sessions, before and after."),
+    ("study", study, "Run the paper's simulation: its tables and figures."),
+    ("export", export, "Write hand-eye, robot or targets for other programs."),
+    ("simulate-controller", simulate_controller, "Serve a simulated robot controller."),
+    ("abb-program", abb_program, "Write the RAPID program for an ABB IRC5."),
+    ("serve-cell", serve_cell, "Take a picture when the robot's own program asks."),
+)
+"""Name, function, and what the list of commands says of it: whole where longer helps would be cut off."""
+
 app.add_typer(new, name="new")
-app.command("doctor")(doctor)
-app.command("plan")(plan)
-app.command("preview")(preview)
-app.command("predict")(predict)
-app.command("capture")(capture)
-app.command("teach")(teach)
-app.command("import")(import_session)
-app.command("centres")(centres)
-app.command("calibrate")(calibrate)
-app.command("verify")(verify)
-app.command("stitch")(stitch)
-app.command("report")(report)
-app.command("show")(show)
-app.command("study")(study)
-app.command("export")(export)
-app.command("simulate-controller")(simulate_controller)
-app.command("abb-program")(abb_program)
-app.command("serve-cell")(serve_cell)
+for name, verb, summary in VERBS:
+    app.command(name, short_help=summary)(verb)
 
 
 @app.callback(invoke_without_command=True)

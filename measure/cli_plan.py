@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from measure.cli_run import AsJson, Debug, Quiet, command
+from measure.cli_run import AsJson, Debug, EarlierCalibration, Quiet, command
 
 if TYPE_CHECKING:
     from calibrate.design_shots import Expectation
@@ -37,9 +37,7 @@ def plan(
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box in the base, mm, for --for workpiece; the work volume if left out."),
     ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option("--calibration", help="An earlier calibration of this cell: its noise is expected instead of a usual one.")
-    ] = None,
+    calibration: EarlierCalibration = None,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from measure.cli_run import AsJson, Debug, Quiet, command
+from measure.cli_run import AsJson, Debug, EarlierCalibration, Quiet, command
 
 if TYPE_CHECKING:
     from calibrate.predict import ArtefactPrediction
@@ -20,9 +20,7 @@ def predict(
         list[str] | None, typer.Option("--spheres", help="Spheres of the cell to judge together, e.g. A,B; all of known place if left out.")
     ] = None,
     n: Annotated[list[str] | None, typer.Option("-n", help="Numbers of shots, e.g. 30,60,120 (the default).")] = None,
-    calibration: Annotated[
-        Path | None, typer.Option("--calibration", help="An earlier calibration of this cell: its noise is expected instead of a usual one.")
-    ] = None,
+    calibration: EarlierCalibration = None,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     as_json: AsJson = False,
     debug: Debug = False,

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
@@ -31,6 +32,9 @@ BAD_VERDICTS = ("fail", "reject")
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, everything else on stderr.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error and the log.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+EarlierCalibration = Annotated[
+    Path | None, typer.Option("--calibration", help="An earlier calibration of this cell: its noise is expected instead of a usual one.")
+]
 
 
 @dataclass(slots=True)

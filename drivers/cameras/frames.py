@@ -1,4 +1,4 @@
-"""What a frame tells about wrong settings: units, axes that look backwards or mirror, nothing in view."""
+"""Whether camera and settings are the right ones: serial number, digest, and what a frame tells (units, axes that look backwards or mirror)."""
 
 from __future__ import annotations
 
@@ -20,6 +20,17 @@ _FEWEST = 50
 def settings_digest(applied: Mapping[str, object]) -> str:
     """16 hex digits of everything that was set and that changes where points lie; the order of keys is no matter."""
     return hashlib.sha256(json.dumps(applied, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def require_serial(found: str | None, named: str | None) -> None:
+    """Nothing, where the camera's serial number is the one that the settings name, or where they name none.
+
+    Raises:
+        CameraMisconfigured: another camera.
+    """
+    if named is not None and found != named:
+        what = f"the camera has the serial number {found}, the cell file names {named}"
+        raise CameraMisconfigured(what, where="camera.serial", remedy="Connect the right camera, or correct the cell file and calibrate again.")
 
 
 def frame_problems(xyz_mm: FloatImage) -> list[str]:

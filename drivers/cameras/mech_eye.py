@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from drivers.cameras.frames import settings_digest
+from drivers.cameras.frames import require_serial, settings_digest
 from drivers.cameras.settings import CameraSettings, parse_settings
 from drivers.cameras.vendor import VendorCamera, VendorScan, stdout_to_stderr
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, CameraTimeout
@@ -105,9 +105,7 @@ class MechEyeSession:
     def _info(self, told: Any) -> CameraInfo:
         said = self._settings
         serial = str(told.serial_number)
-        if said.serial is not None and serial != said.serial:
-            found = f"the camera has the serial number {serial}, the cell file names {said.serial}"
-            raise CameraMisconfigured(found, where="camera.serial", remedy="Connect the right camera, or correct the cell file and calibrate again.")
+        require_serial(serial, said.serial)
         return CameraInfo(
             adapter="mech_eye",
             vendor="Mech-Mind",

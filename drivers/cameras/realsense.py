@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from drivers.cameras.depth_images import Intrinsics, depth_points_mm
-from drivers.cameras.frames import settings_digest
+from drivers.cameras.frames import require_serial, settings_digest
 from drivers.cameras.realsense_settings import RealsenseSettings
 from drivers.cameras.settings import parse_settings
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, CameraTimeout
@@ -183,9 +183,7 @@ class RealsenseCamera:
 
         said = self._settings
         serial = told(rs.camera_info.serial_number)
-        if said.serial is not None and serial != said.serial:
-            found = f"the camera has the serial number {serial}, the cell file names {said.serial}"
-            raise CameraMisconfigured(found, where="camera.serial", remedy="Connect the right camera, or correct the cell file and calibrate again.")
+        require_serial(serial, said.serial)
         intrinsics = _intrinsics(profile.get_intrinsics())
         data = {"intrinsics": asdict(intrinsics), "fps": profile.fps(), "unit_mm": round(self._unit_mm, 9), "options": dict(said.options)}
         notes = (f"depths come in steps of {self._unit_mm:g} mm: set depth_unit_mm to 0.1 or finer",) if self._unit_mm > 1.001 * _COARSE_MM else ()

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from drivers.cameras.frames import settings_digest
+from drivers.cameras.frames import require_serial, settings_digest
 from drivers.cameras.settings import CameraSettings, parse_settings
 from drivers.cameras.vendor import VendorCamera, VendorScan
-from drivers.errors import CameraMisconfigured, CameraNotReached, CameraSdkMissing
+from drivers.errors import CameraNotReached, CameraSdkMissing
 from drivers.files.disk import read_bytes, sha256_hex
 from drivers.files.schema import Text
 from drivers.protocols import CameraInfo
@@ -96,9 +96,7 @@ class ZividSession:
 
     def _info(self, zivid: Any, digest: str) -> CameraInfo:
         said, told = self._settings, self._camera.info
-        if said.serial is not None and str(told.serial_number) != said.serial:
-            found = f"the camera has the serial number {told.serial_number}, the cell file names {said.serial}"
-            raise CameraMisconfigured(found, where="camera.serial", remedy="Connect the right camera, or correct the cell file and calibrate again.")
+        require_serial(str(told.serial_number), said.serial)
         return CameraInfo(
             adapter="zivid",
             vendor="Zivid",

@@ -41,6 +41,12 @@ def places_in_base_mm(calibration: Calibration, shots: Sequence[SyntheticShot]) 
     return np.concatenate([calibration.points_in_base_mm(s.points_in_camera_mm, joints_rad=s.joints_rad) for s in shots])
 
 
+def misses_mm(calibration: Calibration, tests: Sequence[SyntheticShot], cell: SyntheticCell) -> FloatArray:
+    """(n,) distance of held-out points from the best-fitting true ones: the stated base is not the true one."""
+    found, true = places_in_base_mm(calibration, tests), true_places_mm(cell, tests)
+    return np.asarray(np.linalg.norm(se3.apply(se3.fit_rigid(found, true), found) - true, axis=1))
+
+
 def true_places_mm(cell: SyntheticCell, shots: Sequence[SyntheticShot]) -> FloatArray:
     """(n, 3) where the points of noise-free shots truly are, in the cell's own base."""
     result = []

@@ -6,7 +6,7 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 
-from drivers.cameras.frames import require_plausible, settings_digest
+from drivers.cameras.frames import require_plausible, require_serial, settings_digest
 from drivers.cameras.genicam.decode import decode
 from drivers.cameras.genicam.scan3d import Scan3d, problems, read_scan3d
 from drivers.cameras.genicam.settings import GenicamSettings
@@ -47,7 +47,7 @@ class GenicamCamera:
         self.close()
         who = self._transport.open()
         try:
-            self._check_serial(who)
+            require_serial(who.serial, self._settings.serial)
             self._apply()
             self._scan3d = read_scan3d(self._transport.get, self._put_selector)
             self._check()
@@ -89,12 +89,6 @@ class GenicamCamera:
         self._end_stream()
         self._opened, self._lost = False, None
         self._transport.close()
-
-    def _check_serial(self, who: DeviceIdentity) -> None:
-        expected = self._settings.serial
-        if expected is not None and who.serial != expected:
-            found = f"the camera has the serial number {who.serial}, the cell file names {expected}"
-            raise CameraMisconfigured(found, where="camera.serial", remedy="Connect the right camera, or correct the cell file and calibrate again.")
 
     def _apply(self) -> None:
         transport, said = self._transport, self._settings

@@ -13,12 +13,10 @@ from calibrate.observations import Observations, SphereShot
 from calibrate.solve import CalibrationSettings, calibrate, solve_observations
 from drivers.errors import SettingsError
 from drivers.files.session import read_session
-from drivers.kinematics import se3
-from drivers.kinematics.se3 import FloatArray
 from tests.support.solving import draw_shots, noise_free, off_by
-from tests.support.synthetic import SyntheticCell, SyntheticShot, paper_cell
+from tests.support.synthetic import SyntheticShot, paper_cell
 from tests.support.synthetic_session import write_session
-from tests.support.unseen import places_in_base_mm, random_unseen_lengths, true_places_mm
+from tests.support.unseen import misses_mm, places_in_base_mm, random_unseen_lengths
 from tests.support.volume import volume_cell
 
 CENTRES = CalibrationSettings(camera_error="pillow", method="centres")
@@ -44,15 +42,10 @@ def plain(shots: list[SyntheticShot], tmp_path_factory: pytest.TempPathFactory) 
     return run(write_session(tmp_path_factory.mktemp("plain") / "s", CELL, {"A": shots}, flange_from_camera=None))
 
 
-def misses_mm(calibration: Calibration, tests: list[SyntheticShot], cell: SyntheticCell = CELL) -> FloatArray:
-    found, true = places_in_base_mm(calibration, tests), true_places_mm(cell, tests)
-    return np.asarray(np.linalg.norm(se3.apply(se3.fit_rigid(found, true), found) - true, axis=1))
-
-
 def test_the_result_says_how_it_was_made_and_unseen_points_come_out_where_they_are(
     plain: Calibration, tests: list[SyntheticShot], tmp_path: Path
 ) -> None:
-    assert np.sqrt((misses_mm(plain, tests) ** 2).mean()) < 0.06
+    assert np.sqrt((misses_mm(plain, tests, CELL) ** 2).mean()) < 0.06
     assert (plain.statistics.n_shots, plain.statistics.used, plain.statistics.rank) == (40, 40, 27)
     assert plain.to_json_dict()["method"] == plain.method == "centres"
     plain.save(tmp_path / "c.yaml")

@@ -16,11 +16,10 @@ from calibrate.solve import CalibrationSettings, calibrate
 from drivers.errors import DataError, SettingsError
 from drivers.files.session import read_session
 from drivers.kinematics import se3
-from drivers.kinematics.se3 import FloatArray
 from tests.support.solving import draw_shots, noise_free, off_by
-from tests.support.synthetic import SyntheticCell, SyntheticShot, paper_cell, sample_cap
+from tests.support.synthetic import SyntheticShot, paper_cell, sample_cap
 from tests.support.synthetic_session import write_session
-from tests.support.unseen import UnseenLength, places_in_base_mm, true_places_mm, unseen_length
+from tests.support.unseen import UnseenLength, misses_mm, places_in_base_mm, unseen_length
 
 PILLOW = CalibrationSettings(camera_error="pillow")
 CELL = paper_cell()
@@ -46,14 +45,8 @@ def plain(shots: list[SyntheticShot], tmp_path_factory: pytest.TempPathFactory) 
     return run(write_session(tmp_path_factory.mktemp("plain") / "s", CELL, {"A": shots}, flange_from_camera=None))
 
 
-def misses_mm(calibration: Calibration, tests: Sequence[SyntheticShot], cell: SyntheticCell = CELL) -> FloatArray:
-    """(n,) distance of held-out points from the best-fitting true ones: the stated base is not the true one."""
-    found, true = places_in_base_mm(calibration, tests), true_places_mm(cell, tests)
-    return np.asarray(np.linalg.norm(se3.apply(se3.fit_rigid(found, true), found) - true, axis=1))
-
-
 def test_unseen_points_come_out_where_they_are(plain: Calibration, tests: list[SyntheticShot]) -> None:
-    assert np.sqrt((misses_mm(plain, tests) ** 2).mean()) < 0.06
+    assert np.sqrt((misses_mm(plain, tests, CELL) ** 2).mean()) < 0.06
     assert (plain.statistics.n_shots, plain.statistics.used, plain.statistics.rank) == (40, 40, 27)
     assert plain.method == "clouds"
     # no limits and no certified length: nobody may call it a pass
