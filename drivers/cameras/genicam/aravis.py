@@ -26,6 +26,7 @@ _SUCCESS = 0
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _WANTED_BUFFER = 8 * 1024 * 1024
 _STATUS = {1: "is empty", 2: "lacks packets", 3: "lacks packets", 4: "has packets out of order", 5: "does not fit its buffer", 7: "was aborted"}
+LOST_CAMERA_THREAD = "aravis-lost-camera"
 _REMEDY = "Check cable, power and address; see that the camera answers `ping`."
 
 
@@ -126,7 +127,7 @@ class AravisTransport:
                     library.call("g_object_unref", handle)
 
         if self._lost:
-            threading.Thread(target=let_go, name="aravis-lost-camera", daemon=True).start()
+            threading.Thread(target=let_go, name=LOST_CAMERA_THREAD, daemon=True).start()
         else:
             let_go()
 
