@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -54,11 +55,18 @@ class VendorSoftware:
                 stream.flush()
                 time.sleep(self.pause_s)
 
+    def _asked(self) -> tuple[bytes, int] | None:
+        """Text and time of the trigger file, both of one and the same file: it may be replaced, or go away, at any moment."""
+        try:
+            with (self.folder / TRIGGER).open("rb") as stream:
+                return stream.read(), os.fstat(stream.fileno()).st_mtime_ns
+        except FileNotFoundError:
+            return None
+
     def _serve(self) -> None:
-        seen: str | None = None
+        seen: tuple[bytes, int] | None = None
         while not self._stop.wait(0.005):
-            path = self.folder / TRIGGER
-            asked = path.read_text(encoding="utf-8") + str(path.stat().st_mtime_ns) if path.exists() else None
+            asked = self._asked()
             if asked is None or asked == seen:
                 continue
             seen = asked
