@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibrate import normal
 from calibrate.clouds import Solution
 from calibrate.problem import Problem
-from calibrate.validation import predict, shot_centre_covariance_mm2
+from calibrate.validation import judge_arcs, predict, shot_centre_covariance_mm2
 from drivers.kinematics.se3 import FloatArray
 
 REJECT_CHI2 = 30.7
@@ -35,14 +35,20 @@ class Unexplained(NamedTuple):
     """(m,)."""
     miss_mm: FloatArray
     """(m,) how far each shot's sphere lies from where the others put it."""
+    chi2: FloatArray
+    """(m,) squared miss in units of what noise and the others' own uncertainty explain; zero of far ones."""
+    directions: FloatArray
+    """(m,) in how many directions a shot shows its centre: what `chi2` is on average."""
 
 
 def unexplained(problem: Problem, solution: Solution) -> Unexplained:
-    """Judge every shot of an area camera by the others; shots of a line profile have no centre of their own and all pass."""
-    if not problem.along_sight:
-        return Unexplained(np.zeros(problem.n_shots, dtype=bool), np.zeros(problem.n_shots))
-    miss = predict(problem, solution.state).centre_error_mm
-    own, sensitivity = shot_centre_covariance_mm2(problem, solution)
+    """Judge every shot by the others: an area camera's by its centre, a profile's by what of a centre it shows."""
+    if problem.along_sight:
+        miss = predict(problem, solution.state).centre_error_mm
+        own, sensitivity = shot_centre_covariance_mm2(problem, solution)
+        directions = np.full(problem.n_shots, 3.0)
+    else:
+        miss, own, sensitivity, directions = judge_arcs(problem, solution)
     # whitened by each shot's own covariance
     root = np.linalg.cholesky(own)
     white, sensitivity = np.linalg.solve(root, miss[..., None])[..., 0], np.linalg.solve(root, sensitivity)
@@ -58,7 +64,7 @@ def unexplained(problem: Problem, solution: Solution) -> Unexplained:
         chi2 = np.where(far, 0.0, np.einsum("mi,mi->m", white, without))
         worst = int(np.argmax(chi2))
         if chi2[worst] <= REJECT_CHI2 * max(1.0, float(np.median(chi2[~far])) / _MEDIAN_CHI2) or far.sum() > problem.n_shots // 2:
-            return Unexplained(far, others_mm)
+            return Unexplained(far, others_mm, chi2, directions)
         far[worst] = True
         white = white + sensitivity @ (pulls[worst].T @ without[worst])
         covariance = covariance + pulls[worst].T @ inverse[worst] @ pulls[worst]

@@ -28,6 +28,7 @@ from calibrate.next_poses import Taken, next_best_poses, pose_text, shortcomings
 from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
 from calibrate.provenance import identity_of, inputs_of
+from calibrate.rejection import unexplained
 from calibrate.result import Calibration, ShotResult, Statistics
 from calibrate.result_file import calibration_data
 from calibrate.sources import artefact_covariance
@@ -41,7 +42,6 @@ from drivers.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calibrate.solve import Solved
-
 
 def make_result(
     solved: Solved,
@@ -70,7 +70,7 @@ def make_result(
     line_profile = not problem.along_sight
     held_out_rms = solved.held_out.radial_rms_mm if line_profile else solved.held_out.centre_rms_mm
     predicted_rms = None if line_profile else _predicted_centre_rms(assembled, solution)
-    scale = 1.0 if predicted_rms is None else max(1.0, (held_out_rms / predicted_rms) ** 2)
+    scale = _arcs_scale(problem, solution) if predicted_rms is None else max(1.0, (held_out_rms / predicted_rms) ** 2)
     external_rms, external_predicted = rms_mm(solved.external_held_out_mm), predicted_rms_mm(solution)
     if np.isfinite(external_rms):
         scale = max(scale, (external_rms / external_predicted) ** 2)
@@ -139,6 +139,7 @@ def make_result(
         radius_offset_mm=solution.state.radius_offset_mm,
         ignores_lengths=method == "stepwise",
         line_profile=line_profile,
+        point_noise_mm=solution.noise.point_mm,
         covariance_scale=scale,
         external_rms_mm=external_rms if np.isfinite(external_rms) else None,
         shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
@@ -151,6 +152,12 @@ def make_result(
     budget = _budget(result, cell, assembled, solution, scale)
     result = replace(result, verdict=verdict, reasons=reasons + notes, next_best_poses=next_poses, error_budget=budget)
     return replace(result, id=str(calibration_data(result)["id"]))
+
+
+def _arcs_scale(problem: Problem, solution: Solution) -> float:
+    """By how much the misses of profiles, each judged by the others, have more variance than what is known of explains."""
+    found = unexplained(problem, solution)
+    return max(1.0, float(found.chi2.sum() / found.directions.sum()))
 
 
 def _all_joints(problem: Problem) -> FloatArray | None:
@@ -242,6 +249,8 @@ def _shot_results(
             centre_in_camera_mm=solution.geometry.centre_in_camera_mm[i],
             centre_in_base_mm=None if line_profile else in_base[i],
             predicted_error_mm=None if np.isnan(errors[i]) else float(errors[i]),
+            joints_rad=shot.joints_rad,
+            base_from_flange=shot.base_from_flange if shot.joints_rad is None else None,
         )
         for i, shot in enumerate(assembled.shots)
     )

@@ -18,6 +18,7 @@ from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
 from calibrate.centres import cross_validate_centres, require_centres, solve_centres
 from calibrate.clouds import Solution, solve_clouds, thinned
+from calibrate.distinct_views import held_by_priors, is_starved
 from calibrate.external_points import ExternalShot
 from calibrate.external_solve import held_out_errors, joined_by_external, solve_robot_alone, without_spoiled
 from calibrate.external_verdict import robot_alone_result
@@ -205,6 +206,10 @@ def solve_observations(
     first = assemble(observations.shots, cell=cell, model=model, camera_error=models[-1], priors=settings.priors)
     if settings.method == "centres":
         require_centres(first.problem)
+    starved = not observations.external and is_starved(first.problem)
+    if starved:
+        first, models = first.subset(np.arange(first.problem.n_shots), models[0]), models[:1]
+        first = replace(first, problem=replace(first.problem, priors=held_by_priors(settings.priors)))
     start, keep, rejected = _start(first, cell)
     problem = replace(first.problem, first_flange_from_camera=start.flange_from_camera)
     if settings.method == "clouds":
@@ -213,11 +218,13 @@ def solve_observations(
         spoiled = tuple(_not_taken(shot, settings.method) for shot in observations.external)
     first, rejected = replace(first, problem=problem), rejected + spoiled
     compared: dict[str, float] = {}
-    if is_open(models, problem):
+    if is_open(models, problem) and not starved:
         keep, about, rejected = _solved_on_some_points(solver, first, start, keep, rejected)
         choice = choose_model(about, models)
         first, start, compared = first.subset(np.arange(first.problem.n_shots), choice.model), choice.state, dict(choice.held_out_rms_mm)
     solved = _solve_and_reject(solver, first, start, keep, rejected)
+    if starved:
+        return replace(solved, solution=replace(solved.solution, held=True)), compared
     arm = choose_terms(solved.solution) if settings.method == "clouds" and settings.robot_terms == "auto" else NO_CHOICE
     _LOG.debug("held-out rms by camera error model: %s, by terms of the arm: %s", compared, arm.held_out_rms_mm)
     if not arm.names:
@@ -241,11 +248,11 @@ def _start(assembled: Assembled, cell: Cell) -> tuple[State, NDArray[np.int64], 
     """First guess, the shots that fit it, and those that do not."""
     problem, shots = assembled.problem, assembled.shots
     if not problem.along_sight:
-        found = start_from_arcs(problem, cell.flange_from_camera)
-        check_arcs(problem, shots, found.scale_mm)
-        return found.state, np.arange(len(shots)), ()
-    centres = np.array([shot.centre_in_camera_mm for shot in shots], dtype=np.float64)
-    start = start_from_centres(problem, centres, cell.flange_from_camera)
+        start = start_from_arcs(problem, cell.flange_from_camera)
+        check_arcs(problem, shots, start.scale_mm)
+    else:
+        centres = np.array([shot.centre_in_camera_mm for shot in shots], dtype=np.float64)
+        start = start_from_centres(problem, centres, cell.flange_from_camera)
     rejected = tuple(_too_far(shots[i], start.miss_mm[i]) for i in np.flatnonzero(start.spoiled))
     return start.state, np.flatnonzero(~start.spoiled), rejected
 
@@ -255,7 +262,7 @@ def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep
     for _ in range(_REJECT_ROUNDS):
         part = everything.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = unexplained(part.problem, solution)
+        far, miss_mm = unexplained(part.problem, solution)[:2]
         external, spoiled = without_spoiled(solution)
         if not far.any() and not spoiled:
             break
@@ -273,7 +280,7 @@ def _solved_on_some_points(
     for _ in range(_REJECT_ROUNDS):
         part = thin.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = unexplained(part.problem, solution)
+        far, miss_mm = unexplained(part.problem, solution)[:2]
         if not far.any():
             break
         rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))

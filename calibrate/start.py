@@ -32,7 +32,7 @@ class Start:
 
     state: State
     miss_mm: FloatArray
-    """(m,) distance of each shot's own centre from where the state expects it; zeros for line profiles."""
+    """(m,) distance of each shot's own centre from where the state expects it; for line profiles the rms of an arc left out, zero of others."""
     scale_mm: float
     """Robust sigma of one component of the misses."""
 
@@ -110,7 +110,7 @@ def _linear_hand_eye(problem: Problem, centres: FloatArray) -> FloatArray | None
         miss = np.linalg.norm(columns @ unknowns + translation, axis=1)
         weight = _weights(miss, max(1.4826 * float(np.median(miss)) / 1.54, 1e-3))
     matrix = unknowns[:9].reshape(3, 3)
-    if not np.isfinite(matrix).all() or np.linalg.det(matrix) <= 0:
+    if not np.isfinite(matrix).all():
         return None
     return se3.from_rotation_translation(se3.nearest_rotation(matrix), unknowns[9:12])
 

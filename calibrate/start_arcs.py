@@ -1,7 +1,7 @@
 """A first guess from line profiles: many starts, since one arc leaves the side of its plane open (METHOD.md 5).
 
 All starts are refined side by side (Levenberg-Marquardt on thinned-out arcs). A given guess that leads to a good fit
-near itself is taken without them.
+near itself is taken without them. A few arcs that lie far from where the others put them are then left out.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.problem import IntArray, Problem
 from calibrate.start import Start, initial_state
@@ -16,11 +17,15 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
+BoolArray = NDArray[np.bool_]
+
 _N_STARTS = 48
 _POINTS_PER_ARC = 16
 _ROUNDS, _FINALISTS, _FINAL_ROUNDS = 25, 6, 60
 _LEVER_MM = 300.0
 _GOOD_MM, _NEAR_MM, _NEAR_RAD = 0.5, 100.0, 0.35
+_SPOILED, _SPOILED_MM, _MOST_SPOILED, _SPOILED_ROUNDS = 4.0, 1.0, 0.25, 6
+"""An arc this many times further off than the median one, and so far at least, is left out; not more than a quarter of all."""
 _ENOUGH_ARCS = 12
 """With fewer a wrong solution may fit as well, and all starts are compared."""
 
@@ -37,6 +42,13 @@ class _Arcs:
     """(N, S), 1 for the point's sphere."""
     radius_mm: FloatArray
     """(N,)"""
+    shot: IntArray
+    """(N,) of each point."""
+
+    def of_shots(self, keep: BoolArray) -> _Arcs:
+        """The arcs of some shots (m,)."""
+        rows = keep[self.shot]
+        return _Arcs(self.base_from_flange[rows], self.points_in_camera_mm[rows], self.member[rows], self.radius_mm[rows], self.shot[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,12 +80,12 @@ def start_from_arcs(problem: Problem, guess: FloatArray | None, seed: int = 7447
     if guess is not None:
         guessed = _refined(arcs, _start(problem, mean, guess[None, :3, :3]), _FINAL_ROUNDS)
         if problem.n_shots >= _ENOUGH_ARCS and _is_good(guessed, guess):
-            return _as_start(problem, guessed)
+            return _as_start(problem, arcs, guessed)
     quaternions = np.random.default_rng(seed).normal(size=(n_starts, 4))
     fits = _refined(arcs, _start(problem, mean, _rotation_of_quaternion(quaternions)), _ROUNDS)
     fits = _refined(arcs, fits.part(np.argsort(fits.rms_mm, kind="stable")[:_FINALISTS]), _FINAL_ROUNDS)
     fits = fits.part(np.argsort(fits.rms_mm, kind="stable")[:1])
-    return _as_start(problem, fits if guess is None or fits.rms_mm[0] < guessed.rms_mm[0] else guessed)
+    return _as_start(problem, arcs, fits if guess is None or fits.rms_mm[0] < guessed.rms_mm[0] else guessed)
 
 
 def _is_good(fits: _Fits, guess: FloatArray) -> bool:
@@ -81,9 +93,31 @@ def _is_good(fits: _Fits, guess: FloatArray) -> bool:
     return bool(fits.rms_mm[0] < _GOOD_MM and np.linalg.norm(off[:3]) < _NEAR_MM and np.linalg.norm(off[3:]) < _NEAR_RAD)
 
 
-def _as_start(problem: Problem, fits: _Fits) -> Start:
+def _as_start(problem: Problem, arcs: _Arcs, fits: _Fits) -> Start:
+    fits, miss_mm, keep = _without_spoiled(arcs, fits, problem.n_shots)
     state = initial_state(problem, fits.flange_from_camera[0], fits.centres_in_base_mm[0])
-    return Start(state, np.zeros(problem.n_shots), float(fits.rms_mm[0]))
+    return Start(state, np.where(keep, 0.0, miss_mm), float(fits.rms_mm[0]))
+
+
+def _without_spoiled(arcs: _Arcs, fits: _Fits, n_shots: int) -> tuple[_Fits, FloatArray, BoolArray]:
+    """A fit (B = 1) of all arcs but a few far ones, the rms (m,) of each arc about it, and which arcs it is of."""
+    keep = np.ones(n_shots, dtype=bool)
+    for _ in range(_SPOILED_ROUNDS):
+        miss_mm = _rms_of_shots_mm(arcs, fits, n_shots)
+        far = miss_mm > max(_SPOILED * float(np.median(miss_mm)), _SPOILED_MM)
+        if far.mean() > _MOST_SPOILED or (far == ~keep).all():
+            break
+        keep = ~far
+        part = arcs.of_shots(keep)
+        fits = _refined(part, _linearised(part, fits)[0], _FINAL_ROUNDS)
+    return fits, _rms_of_shots_mm(arcs, fits, n_shots), keep
+
+
+def _rms_of_shots_mm(arcs: _Arcs, fits: _Fits, n_shots: int) -> FloatArray:
+    """(m,) about a fit (B = 1)."""
+    _, _, residual = _linearised(arcs, fits)
+    squares = np.bincount(arcs.shot, residual[0] ** 2, minlength=n_shots)
+    return np.asarray(np.sqrt(squares / np.bincount(arcs.shot, minlength=n_shots)))
 
 
 def _start(problem: Problem, mean_in_camera_mm: FloatArray, rotations: FloatArray) -> _Fits:
@@ -156,5 +190,5 @@ def _thinned(problem: Problem) -> tuple[_Arcs, FloatArray]:
     chosen = [np.linspace(a, b - 1, min(_POINTS_PER_ARC, b - a)).astype(np.int64) for a, b in ends]
     shot = np.repeat(np.arange(problem.n_shots), [len(rows) for rows in chosen])
     points, sphere = problem.points_in_camera_mm[np.concatenate(chosen)], problem.sphere[shot]
-    arcs = _Arcs(problem.base_from_flange[shot], points, np.eye(len(problem.radius_mm))[sphere], problem.radius_mm[sphere])
+    arcs = _Arcs(problem.base_from_flange[shot], points, np.eye(len(problem.radius_mm))[sphere], problem.radius_mm[sphere], shot)
     return arcs, np.array([problem.points_in_camera_mm[rows].mean(axis=0) for rows in chosen])

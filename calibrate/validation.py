@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calibrate import normal
 from calibrate.assemble import subset, without_pose_noise
 from calibrate.clouds import Solution, solve_clouds
+from calibrate.normal import NoiseModel
 from calibrate.problem import Geometry, Problem, State, linearise_geometry
 from calibrate.sums import shot_moments
 from drivers.kinematics import se3
@@ -22,6 +23,8 @@ _LINEAR_MM = 0.2
 """Motion of a centre up to which the linearisation of the whole solve is good to a micrometre."""
 _CENTRE_ROUNDS, _CENTRE_TOLERANCE_MM = 6, 1e-7
 _LEAVE_ONE_OUT_BELOW = 30
+_OPEN_MM = 5.0
+"""How near a profile's centre is taken to be along the direction that it hardly shows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,15 +150,35 @@ def shot_centre_covariance_mm2(problem: Problem, solution: Solution) -> tuple[Fl
 
     The second result (m, 3, P) is the motion of the shot's fixed-radius centre, less its sphere's, per unknown.
     """
-    noise = solution.noise
-    rotation = solution.geometry.base_from_camera[:, :3, :3]
-    rotation_t = np.swapaxes(rotation, -1, -2)
-    moments = solution.moments
-    inverse = np.linalg.inv(moments[:, :3, :3])
-    weight = noise.point_weight(np.diff(problem.starts).astype(np.float64))
-    centre = se3.apply(solution.geometry.base_from_camera, solution.geometry.centre_in_camera_mm)
-    lever = se3.hat(centre - solution.geometry.base_from_flange[:, :3, 3])
+    weight = solution.noise.point_weight(np.diff(problem.starts).astype(np.float64))
+    return _covariance_and_sensitivity(solution.geometry, solution.moments, np.linalg.inv(solution.moments[:, :3, :3]), weight, solution.noise)
+
+
+def judge_arcs(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """What of a centre each line profile shows: misses (m, 3), their covariance (m, 3, 3), what moves them (m, 3, P); base axes.
+
+    The last result (m,) is the number of directions in which it does. An arc holds two directions of its centre well and the
+    third hardly, so the miss is one step from the solution, held to some mm. Every point counts in full: the robust loss leaves
+    a far arc without any, and so without a miss.
+    """
+    state = without_pose_noise(solution.state, problem.n_scans)
+    geometry = linearise_geometry(problem, state)
+    moments, _ = shot_moments(problem, state, geometry, np.inf)
+    weight = solution.noise.point_weight(np.diff(problem.starts).astype(np.float64))
+    inverse = np.linalg.inv(moments[:, :3, :3] + (_OPEN_MM**-2 / weight)[:, None, None] * np.eye(3))
+    miss = (geometry.base_from_camera[:, :3, :3] @ (inverse @ moments[:, :3, -1:]))[..., 0]
+    directions = np.einsum("mij,mji->m", inverse, moments[:, :3, :3])
+    return miss, *_covariance_and_sensitivity(geometry, moments, inverse, weight, solution.noise), directions
+
+
+def _covariance_and_sensitivity(
+    geometry: Geometry, moments: FloatArray, inverse: FloatArray, weight: FloatArray, noise: NoiseModel
+) -> tuple[FloatArray, FloatArray]:
+    """Of own centres, base axes; `inverse` (m, 3, 3) of their part of the moments (m, v, v)."""
+    rotation = geometry.base_from_camera[:, :3, :3]
+    centre = se3.apply(geometry.base_from_camera, geometry.centre_in_camera_mm)
+    lever = se3.hat(centre - geometry.base_from_flange[:, :3, 3])
     pose = noise.pose_mm**2 * np.eye(3) + noise.pose_rad**2 * lever @ np.swapaxes(lever, -1, -2)
-    points = rotation @ (inverse / weight[:, None, None]) @ rotation_t
-    sensitivity = rotation @ (inverse @ (moments[:, :3, :-1] @ solution.geometry.columns))
+    points = rotation @ (inverse / weight[:, None, None]) @ np.swapaxes(rotation, -1, -2)
+    sensitivity = rotation @ (inverse @ (moments[:, :3, :-1] @ geometry.columns))
     return points + pose, sensitivity

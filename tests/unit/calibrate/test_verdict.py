@@ -72,6 +72,9 @@ def test_all_reasons_are_told_and_the_grave_ones_first() -> None:
     assert "rank" in reasons[0]
 
 
-def test_a_line_profile_has_no_centre_limit() -> None:
+@pytest.mark.parametrize(("point_noise_mm", "expected"), [(0.495, "marginal"), (0.1, "fail")])
+def test_noise_of_points_is_not_held_against_profiles_and_what_is_left_is(point_noise_mm: float, expected: str) -> None:
     profile = replace(GOOD, line_profile=True, cross_validated_rms_mm=0.5, has_joints=False, length_expanded_uncertainty_mm=None)
-    assert judge(profile, replace(WHOLE, rank=6, expected_rank=6))[0] == "marginal"
+    verdict, reasons = judge(replace(profile, point_noise_mm=point_noise_mm), replace(WHOLE, rank=6, expected_rank=6))
+    assert verdict == expected
+    assert any("held-out profiles lie off their sphere" in reason for reason in reasons) == (expected == "fail")
