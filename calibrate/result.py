@@ -55,6 +55,10 @@ class ShotResult:
     """(3,) fixed-radius centre of this shot alone, calibrated; None for a line profile."""
     predicted_error_mm: float | None
     """Distance of the centre from where a solve without this shot expects it (line profiles: radial rms)."""
+    joints_rad: FloatArray | None = None
+    """(n,) where the robot stood, so that a verification can tell its own poses; None in pose-only and older files."""
+    base_from_flange: FloatArray | None = None
+    """(4, 4) of a pose-only calibration; None elsewhere and in older files."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 FORMAT = "spherecal-calibration/1"
 _NOT_IN_ID = ("id", "created_utc", "software", "seconds")
+_OF_POSES = ("joints_rad", "base_from_flange")
 _Kind = TypeVar("_Kind", bound="Calibration")
 
 
@@ -196,7 +197,8 @@ def _term(data: Mapping[str, object]) -> RobotTerm:
 
 
 def _shot_data(shot: ShotResult) -> dict[str, object]:
-    return {name: getattr(shot, name) for name in shot.__slots__}
+    data = {name: getattr(shot, name) for name in shot.__slots__}
+    return {name: value for name, value in data.items() if value is not None or name not in _OF_POSES}
 
 
 def _shot(data: Mapping[str, object]) -> ShotResult:
@@ -215,6 +217,8 @@ def _shot(data: Mapping[str, object]) -> ShotResult:
         centre_in_camera_mm=_array(data["centre_in_camera_mm"]),
         centre_in_base_mm=None if centre is None else _array(centre),
         predicted_error_mm=None if predicted is None else float(_array(predicted)),
+        joints_rad=_array(data["joints_rad"]) if "joints_rad" in data else None,
+        base_from_flange=_array(data["base_from_flange"]) if "base_from_flange" in data else None,
     )
 
 

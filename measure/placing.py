@@ -48,6 +48,16 @@ class TrainingShot(Protocol):
         """Digest of its scan."""
         ...
 
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) where the robot stood; None where it is not known."""
+        ...
+
+    @property
+    def base_from_flange(self) -> FloatArray | None:
+        """(4, 4) where the flange was reported; None where it is not known."""
+        ...
+
 
 class JudgedSystem(MeasuringSystem, Protocol):
     """What verification needs besides."""
@@ -70,6 +80,21 @@ class JudgedSystem(MeasuringSystem, Protocol):
     @property
     def shots(self) -> Sequence[TrainingShot]:
         """The shots it was made from."""
+        ...
+
+    @property
+    def camera_seen_volume_mm(self) -> FloatArray:
+        """(2, 3) corners of the part of the camera frame in which it saw points."""
+        ...
+
+    @property
+    def seen_joints_rad(self) -> FloatArray | None:
+        """(2, n) least and greatest axis angles that it was made with."""
+        ...
+
+    @property
+    def sphere_centres_in_base_mm(self) -> Mapping[str, FloatArray]:
+        """{name: (3,)} where its spheres stood."""
         ...
 
     @property

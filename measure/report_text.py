@@ -8,8 +8,9 @@ import numpy as np
 
 from acquire.cell import Limits
 from measure.decision import RULE
+from measure.proof.lengths import LengthResult
 from measure.report_page import CalibrationFacts, Row, Table
-from measure.verify_result import SHAPED_ON, LengthResult, VerifyResult
+from measure.verify_result import SHAPED_ON, VerifyResult
 
 NOTHING = "–"
 

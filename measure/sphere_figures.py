@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from acquire.sphere_fit import fit_fixed_radius, fit_free_radius
 from drivers.errors import DataError
+from measure.proof.probing import shell_width_mm
+from measure.proof.scatter import OwnCentre, ScatterScale, form_sigma_mm, sandwich, scatter_scale, structured
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 FORM_FRACTION = 0.95
 """Share of the points that the form shell must hold."""
@@ -34,6 +37,8 @@ class SphereView:
     """(n, 3)."""
     start_in_base_mm: FloatArray
     """(3,) a place behind the surface, from which a fit finds the centre and not its mirror image."""
+    pose_covariance_mm2: FloatArray | None = None
+    """(3, 3) by which the view may stand elsewhere as a whole: the shot's pose noise at the sphere; None where nothing is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +83,15 @@ class SphereFigures:
     diameter_error_less_offset_mm: float
     """The same minus twice the calibrated radius offset: what is left when the surface's reading is known."""
     diameter_standard_uncertainty_mm: float
-    """From the scatter between the views alone."""
+    """From the scatter between the views: the larger of what they show and what the calibration's noise predicts."""
     form_mm: float
     """Width of the thinnest concentric shell that holds 95 % of the points."""
     form_all_mm: float
     """Width of the shell that holds them all."""
+    form_standard_uncertainty_mm: float = 0.0
+    """Of `form_mm`, from the scatter between the views."""
+    expected_centre_covariance_mm2: FloatArray | None = None
+    """(3, 3) of the centre as the views should scatter, corrected by how they do; None with one view of unknown noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,8 +121,12 @@ def figures_of(views: Sequence[SphereView], sizes: Mapping[str, SphereSize], *, 
         raise DataError("no shot shows a sphere", remedy="Capture shots of the spheres, or see why they were rejected.")
     names = sorted({view.sphere for view in views})
     by_sphere = {name: [view for view in views if view.sphere == name] for name in names}
-    spheres = {name: _sphere_figures(name, members, sizes[name]) for name, members in by_sphere.items()}
-    rows = [row for name, members in by_sphere.items() for row in _view_figures(members, sizes[name], spheres[name], line_profile=line_profile)]
+    fits = {name: _fit(name, members, sizes[name]) for name, members in by_sphere.items()}
+    own = {name: _own_centres(members, sizes[name], fits[name], line_profile=line_profile) for name, members in by_sphere.items()}
+    known = all(view.pose_covariance_mm2 is not None for view in views)
+    scale = scatter_scale([[centre for centre in centres if centre is not None] for centres in own.values()], known=known)
+    spheres = {name: _sphere_figures(members, sizes[name], fits[name], own[name], scale) for name, members in by_sphere.items()}
+    rows = [row for name, members in by_sphere.items() for row in _view_figures(members, sizes[name], spheres[name], own[name])]
     deviations = [row.deviation_mm for row in rows if row.deviation_mm is not None and spheres[row.sphere].n_views > 1]
     n_points = np.array([row.n_points for row in rows], dtype=np.float64)
     mean_squares = np.array([row.radial_rms_mm for row in rows]) ** 2
@@ -126,56 +139,76 @@ def figures_of(views: Sequence[SphereView], sizes: Mapping[str, SphereSize], *, 
     )
 
 
-def shell_width_mm(radii_mm: FloatArray, fraction: float = FORM_FRACTION) -> float:
-    """Width of the narrowest interval that holds a fraction of the radii (n,), at least one of them."""
-    ordered = np.sort(radii_mm)
-    n_held = max(1, int(np.ceil(fraction * len(ordered))))
-    return float((ordered[n_held - 1 :] - ordered[: len(ordered) - n_held + 1]).min())
-
-
 def separation(first: SphereFigures, second: SphereFigures) -> tuple[float, float]:
     """Distance of two centres in mm and its standard uncertainty from the scatter between the views."""
     difference = second.centre_in_base_mm - first.centre_in_base_mm
     distance = float(np.linalg.norm(difference))
     direction = difference / max(distance, 1e-12)
-    variance = float(direction @ (first.centre_covariance_mm2 + second.centre_covariance_mm2) @ direction)
-    return distance, float(np.sqrt(max(variance, 0.0)))
+    variances = [float(direction @ (first.centre_covariance_mm2 + second.centre_covariance_mm2) @ direction)]
+    if first.expected_centre_covariance_mm2 is not None and second.expected_centre_covariance_mm2 is not None:
+        variances.append(float(direction @ (first.expected_centre_covariance_mm2 + second.expected_centre_covariance_mm2) @ direction))
+    return distance, float(np.sqrt(max(*variances, 0.0)))
 
 
-def _sphere_figures(name: str, views: Sequence[SphereView], size: SphereSize) -> SphereFigures:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """All points of a sphere together, with the radius that it reads at, and free."""
+
+    points: FloatArray
+    groups: IntArray
+    reading_radius_mm: float
+    centre: FloatArray
+    covariance: FloatArray
+    free_centre: FloatArray
+    free_radius_mm: float
+    free_covariance: FloatArray
+
+
+def _fit(name: str, views: Sequence[SphereView], size: SphereSize) -> _Fit:
     points = np.concatenate([view.points_in_base_mm for view in views])
     if len(points) < _LEAST_POINTS:
         raise DataError(f"{len(points)} points on sphere {name} are too few", remedy="Capture it from nearer, or check its finding.")
-    reading_radius = size.radius_mm + size.offset_mm
-    start = np.mean([view.start_in_base_mm for view in views], axis=0)
-    centre, point_covariance = fit_fixed_radius(points, reading_radius, start)
-    free_centre, free_radius, free_covariance = fit_free_radius(points, reading_radius, centre)
-    radii = np.linalg.norm(points - free_centre, axis=1)
+    radius = size.radius_mm + size.offset_mm
+    centre, covariance = fit_fixed_radius(points, radius, np.mean([view.start_in_base_mm for view in views], axis=0))
     groups = np.repeat(np.arange(len(views)), [len(view.points_in_base_mm) for view in views])
-    free_covariance = _between_views(points, groups, free_centre, free_radius, free_covariance)
-    error = 2.0 * (free_radius - size.radius_mm)
+    return _Fit(points, groups, radius, centre, covariance, *fit_free_radius(points, radius, centre))
+
+
+def _sphere_figures(views: Sequence[SphereView], size: SphereSize, fit: _Fit, own: Sequence[OwnCentre | None], scale: ScatterScale) -> SphereFigures:
+    radii = np.linalg.norm(fit.points - fit.free_centre, axis=1)
+    error = 2.0 * (fit.free_radius_mm - size.radius_mm)
+    common, free = (fit.centre, fit.reading_radius_mm), (fit.free_centre, fit.free_radius_mm)
+    radius_variance = [sandwich(fit.points, fit.groups, *free, fit.free_covariance)[3, 3]]
+    moves = [scale.factor * centre.covariance_mm2 for centre in own if centre is not None]
+    expected, form_sigma = None, 0.0
+    if len(moves) == len(views) and (len(views) > 1 or scale.known):
+        expected = structured(fit.points, fit.groups, *common, moves, fit.covariance)
+        radius_variance.append(structured(fit.points, fit.groups, *free, moves, fit.free_covariance)[3, 3])
+        form_sigma = max(form_sigma_mm(fit.points, fit.groups, *free, moves, FORM_FRACTION))
     return SphereFigures(
-        name=name,
+        name=views[0].sphere,
         n_views=len(views),
-        n_points=len(points),
-        centre_in_base_mm=centre,
-        centre_covariance_mm2=_between_views(points, groups, centre, reading_radius, point_covariance),
+        n_points=len(fit.points),
+        centre_in_base_mm=fit.centre,
+        centre_covariance_mm2=sandwich(fit.points, fit.groups, *common, fit.covariance),
         diameter_error_mm=error,
         diameter_error_less_offset_mm=error - 2.0 * size.offset_mm,
-        diameter_standard_uncertainty_mm=2.0 * float(np.sqrt(free_covariance[3, 3])),
-        form_mm=shell_width_mm(radii),
+        diameter_standard_uncertainty_mm=2.0 * float(np.sqrt(max(radius_variance))),
+        form_mm=shell_width_mm(radii, FORM_FRACTION),
         form_all_mm=float(np.ptp(radii)),
+        form_standard_uncertainty_mm=form_sigma,
+        expected_centre_covariance_mm2=expected,
     )
 
 
-def _view_figures(views: Sequence[SphereView], size: SphereSize, sphere: SphereFigures, *, line_profile: bool) -> list[ViewFigures]:
+def _view_figures(views: Sequence[SphereView], size: SphereSize, sphere: SphereFigures, own: Sequence[OwnCentre | None]) -> list[ViewFigures]:
     radius = size.radius_mm + size.offset_mm
-    centres = [None if line_profile else _view_centre(view, radius, sphere.centre_in_base_mm) for view in views]
-    found = [centre for centre in centres if centre is not None]
+    found = [centre.centre_in_base_mm for centre in own if centre is not None]
     mean = np.mean(found, axis=0) if found else None
     rows = []
-    for view, centre in zip(views, centres, strict=True):
+    for view, of_view in zip(views, own, strict=True):
         residual = np.linalg.norm(view.points_in_base_mm - sphere.centre_in_base_mm, axis=1) - radius
+        centre = None if of_view is None else of_view.centre_in_base_mm
         rows.append(
             ViewFigures(
                 session=view.session,
@@ -190,31 +223,16 @@ def _view_figures(views: Sequence[SphereView], size: SphereSize, sphere: SphereF
     return rows
 
 
-def _view_centre(view: SphereView, radius_mm: float, start_mm: FloatArray) -> FloatArray:
+def _own_centres(views: Sequence[SphereView], size: SphereSize, fit: _Fit, *, line_profile: bool) -> list[OwnCentre | None]:
+    """Each view's own centre; none for the arcs of a line profile."""
+    if line_profile:
+        return [None] * len(views)
+    return [_own_centre(view, size.radius_mm + size.offset_mm, fit.centre) for view in views]
+
+
+def _own_centre(view: SphereView, radius_mm: float, start_mm: FloatArray) -> OwnCentre:
     # the common centre is the best start; a system that is centimetres off needs the one behind the view's own cap
     near = np.linalg.norm(view.start_in_base_mm - start_mm) < 0.5 * radius_mm
-    centre, _ = fit_fixed_radius(view.points_in_base_mm, radius_mm, start_mm if near else view.start_in_base_mm)
-    return centre
-
-
-def _between_views(points: FloatArray, groups: NDArray[np.int64], centre: FloatArray, radius_mm: float, fallback: FloatArray) -> FloatArray:
-    """Covariance of a least-squares sphere whose errors are common to all points of a view.
-
-    The "sandwich" of cluster-robust statistics (Liang and Zeger 1986): inv(N) (sum g_j g_j') inv(N), g_j = sum of J' r
-    over a view. Counting each point as independent would call the mean of 10 shifted views good to micrometres. One
-    view cannot show a scatter between views; the points' own covariance `fallback`, (3, 3) or (4, 4) with the radius,
-    is then all there is.
-    """
-    n_views = int(groups[-1]) + 1
-    if n_views < 2:
-        return fallback
-    offset = points - centre
-    distance = np.linalg.norm(offset, axis=1)
-    design = offset / distance[:, None]
-    if len(fallback) == 4:
-        design = np.column_stack([design, np.ones(len(design))])
-    scores = np.zeros((n_views, design.shape[1]))
-    np.add.at(scores, groups, design * (distance - radius_mm)[:, None])
-    inverse = np.linalg.inv(design.T @ design)
-    between = inverse @ (scores.T @ scores) @ inverse * n_views / (n_views - 1)
-    return np.asarray(between + fallback)
+    centre, covariance = fit_fixed_radius(view.points_in_base_mm, radius_mm, start_mm if near else view.start_in_base_mm)
+    moves = np.eye(3) if view.pose_covariance_mm2 is None else view.pose_covariance_mm2
+    return OwnCentre(centre, covariance + moves)

@@ -13,6 +13,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -25,19 +28,20 @@ from drivers.errors import DataError
 from drivers.files.session import Session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
-from measure.decision import Judgement, judge, overall
-from measure.length_uncertainty import End, distance_standard_uncertainty_mm
+from measure.decision import overall
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
-from measure.sphere_figures import Figures, SphereFigures, SphereSize, SphereView, figures_of, separation
-from measure.verify_result import LengthResult, SessionName, VerifyResult
+from measure.proof.judging import gaps_of, judgements
+from measure.proof.lengths import length_results
+from measure.proof.poses import repeated_poses, training_shots
+from measure.proof.probing import ProbingResult, probing_of
+from measure.proof.reach import shots_outside, warnings_of
+from measure.proof.volume import volume_figures
+from measure.sphere_figures import Figures, SphereSize, SphereView, figures_of, separation
+from measure.verify_result import SessionName, VerifyResult
 
 Placing = Callable[[SphereShot, FloatArray], FloatArray]
 """Moves points (n, 3) of a shot from the camera to the base."""
 
-_SAME_POSE_MM, _SAME_POSE_RAD = 5.0, 0.02
-"""Flange poses nearer than this are the same pose of the robot, taught twice or repeated."""
-
-_LEAST_VIEWS = 2
 _EXTERNAL = "external reference point: verification looks at spheres through the camera"
 
 
@@ -56,46 +60,90 @@ def verify(
         sessions: at least one, with shots of spheres.
         cell: spheres, lengths and limits; each session's own copy where None.
         limits: instead of the cell's.
-        allow_training_data: take shots that the calibration was made from; the verdict then is `not_proven` at best.
+        allow_training_data: take shots that the calibration was made from, and its poses; the verdict then is
+            `not_proven` at best.
 
     Raises:
-        DataError: no shot shows a sphere; shots of the calibration itself; sessions whose cells contradict each other.
+        DataError: no shot shows a sphere; shots or poses of the calibration itself; sessions whose cells contradict
+            each other.
         FileError: a session is broken.
     """
     began = time.perf_counter()
     cells = [cell or cell_of_session(session) for session in sessions]
     for session, its_cell in zip(sessions, cells, strict=True):
         check_fits(calibration, session, its_cell)
-    trained = _training_shots(calibration, sessions)
-    if trained and not allow_training_data:
-        raise _flattering(trained)
+    flattery = _flattery(calibration, sessions, allowed=allow_training_data)
     observations = _gather(sessions, cells)
     artefact = artefact_when_seen(*_merged(cells), sessions)
-    spheres, lengths = artefact.spheres, artefact.lengths
-    limits = limits or next((c.limits for c in cells if c.limits is not None), None) or calibration.limits
-    line_profile = cells[0].camera.kind == "line_profile"
-    sizes = {name: SphereSize(s.radius_mm, calibration.radius_offset_mm) for name, s in spheres.items()}
-    views = views_of(observations.shots, calibrated_placing(calibration))
-    _require_still_spheres(views, sessions, spheres)
+    found = verify_observations(
+        calibration,
+        observations,
+        cells[0].model_copy(update={"spheres": artefact.spheres, "lengths": artefact.lengths}),
+        limits=limits or next((c.limits for c in cells if c.limits is not None), None) or calibration.limits,
+        flattery=flattery,
+        folders={session.digest: session.folder for session in sessions},
+    )
+    before = _figures_before(observations, sessions, cells, artefact.spheres, line_profile=cells[0].camera.kind == "line_profile")
+    return replace(
+        found,
+        sessions=tuple(SessionName(session.folder.name, session.digest) for session in sessions),
+        before=before,
+        before_length_errors_mm={} if before is None else _length_errors(before, artefact.lengths),
+        reasons=(*found.reasons, *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def verify_observations(
+    calibration: JudgedSystem,
+    observations: Observations,
+    cell: Cell,
+    *,
+    limits: Limits | None,
+    flattery: Sequence[str] = (),
+    folders: Mapping[str, Path] = MappingProxyType({}),
+) -> VerifyResult:
+    """The same on shots that are in memory already, without the uncalibrated system beside it.
+
+    Args:
+        calibration: the calibration to judge.
+        observations: with at least one shot.
+        cell: spheres and lengths as large as they were when seen.
+        limits: what to judge against; None for none.
+        flattery: what training data are among the shots, in sentences; the verdict then is `not_proven` at best.
+        folders: of the sessions by their digest, for messages.
+
+    Raises:
+        DataError: points that do not fix a sphere; a sphere that stands elsewhere in another session.
+    """
+    line_profile = cell.camera.kind == "line_profile"
+    sizes = {name: SphereSize(s.radius_mm, calibration.radius_offset_mm) for name, s in cell.spheres.items()}
+    views = views_of(observations.shots, calibrated_placing(calibration), calibration.noise)
+    _require_still_spheres(views, cell.spheres, folders)
     figures = figures_of(views, sizes, line_profile=line_profile)
-    before = _figures_before(observations, sessions, cells, spheres, line_profile=line_profile)
-    results = tuple(_length(calibration, length, figures, observations) for length in lengths if set(length.between) <= set(figures.spheres))
-    judgements = () if limits is None else _judgements(limits, figures, results, spheres)
-    verdict, reasons = overall(judgements, _gaps(limits, figures, results, line_profile=line_profile, trained=bool(trained)))
+    lengths = length_results(calibration, cell.lengths, figures, observations.shots)
+    volume = volume_figures(lengths, cell.work_volume_box_mm)
+    outside = shots_outside(calibration, observations.shots)
+    judged = () if limits is None else judgements(limits, figures, lengths, cell.spheres)
+    verdict, reasons = overall(judged, gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery))
     return VerifyResult(
         calibration_id=calibration.id,
-        sessions=tuple(SessionName(session.folder.name, session.digest) for session in sessions),
+        sessions=(),
         observations=observations,
         figures=figures,
-        before=before,
-        lengths=results,
-        before_length_errors_mm={} if before is None else _length_errors(before, lengths),
+        before=None,
+        lengths=lengths,
+        before_length_errors_mm={},
         limits=limits,
-        judgements=judgements,
+        judgements=judged,
         verdict=verdict,
-        reasons=(*reasons, *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
-        held_out=not trained,
-        seconds=time.perf_counter() - began,
+        reasons=reasons,
+        held_out=not flattery,
+        seconds=0.0,
+        probing=() if line_profile else probing_of_views(views, figures, sizes),
+        volume=volume,
+        outside=outside,
+        warnings=(*warnings_of(outside, len(observations.shots)), *(() if volume is None else volume.warnings())),
     )
 
 
@@ -108,12 +156,33 @@ def calibrated_placing(calibration: JudgedSystem) -> Placing:
     return place
 
 
-def views_of(shots: Sequence[SphereShot], place: Placing) -> list[SphereView]:
-    """Shots as views in the base."""
-    return [
-        SphereView(shot.session, shot.index, shot.sphere, place(shot, shot.points_in_camera_mm), place(shot, _behind_surface(shot)[None])[0])
-        for shot in shots
-    ]
+def views_of(shots: Sequence[SphereShot], place: Placing, noise: NoiseModel | None = None) -> list[SphereView]:
+    """Shots as views in the base; `noise` says by how much each may stand elsewhere."""
+    found = []
+    for shot in shots:
+        start = place(shot, _behind_surface(shot)[None])[0]
+        moves = None if noise is None else _pose_covariance_mm2(noise, start - shot.base_from_flange[:3, 3])
+        found.append(SphereView(shot.session, shot.index, shot.sphere, place(shot, shot.points_in_camera_mm), start, moves))
+    return found
+
+
+def _pose_covariance_mm2(noise: NoiseModel, lever_mm: FloatArray) -> FloatArray:
+    """(3, 3) motion of a point at a lever (3,) from the flange, base axes: `NoiseModel` is isotropic at the flange."""
+    lever = se3.hat(lever_mm)
+    return np.asarray(noise.pose_mm**2 * np.eye(3) + noise.pose_rad**2 * lever @ lever.T)
+
+
+def probing_of_views(views: Sequence[SphereView], figures: Figures, sizes: Mapping[str, SphereSize]) -> tuple[ProbingResult, ...]:
+    """Probing error of every view by itself, and of every sphere over all its views."""
+    found = []
+    for name, sphere in figures.spheres.items():
+        members, radius = [view for view in views if view.sphere == name], sizes[name].radius_mm
+        together = probing_of(np.concatenate([view.points_in_base_mm for view in members]), radius, sphere.centre_in_base_mm)
+        found.append(ProbingResult(name, None, None, together))
+        found += [
+            ProbingResult(name, view.session, view.index, probing_of(view.points_in_base_mm, radius, view.start_in_base_mm)) for view in members
+        ]
+    return tuple(found)
 
 
 def _behind_surface(shot: SphereShot) -> FloatArray:
@@ -123,10 +192,29 @@ def _behind_surface(shot: SphereShot) -> FloatArray:
     return np.asarray(mean + 0.7 * shot.radius_mm * mean / np.linalg.norm(mean))
 
 
-def _training_shots(calibration: JudgedSystem, sessions: Sequence[Session]) -> list[tuple[Session, int]]:
-    """Shots (session, index) whose scans the calibration was made from, wherever they lie now."""
-    known = {shot.scan_sha256 for shot in calibration.shots}
-    return [(session, shot.index) for session in sessions for shot in session.shots if shot.sha256 in known]
+def _flattery(calibration: JudgedSystem, sessions: Sequence[Session], *, allowed: bool) -> list[str]:
+    """What of the calibration's own is among the shots; DataError where that is not allowed."""
+    told = []
+    scans, poses = training_shots(calibration.shots, sessions), repeated_poses(calibration.shots, sessions)
+    if scans and not allowed:
+        raise _refused(f"{len(scans)} shots are those that the calibration was made from, so they prove nothing", scans[0])
+    if poses and not allowed:
+        raise _refused(f"{len(poses)} shots repeat robot poses of the calibration, which fits its own poses best: they prove nothing", poses[0])
+    if scans:
+        told.append("shots of the calibration itself were used: the figures flatter")
+    if len(poses) > len(scans):
+        told.append(f"{len(poses)} shots repeat robot poses of the calibration: the figures flatter")
+    return told
+
+
+def _refused(message: str, where: tuple[Session, int]) -> DataError:
+    session, index = where
+    return DataError(
+        message,
+        file=session.folder,
+        where=f"shot {index}",
+        remedy="Verify on other shots from other poses (`spherecal plan --for verify`); --allow-training-data shows the figures with that remark.",
+    )
 
 
 def _gather(sessions: Sequence[Session], cells: Sequence[Cell]) -> Observations:
@@ -159,12 +247,12 @@ def _merged(cells: Sequence[Cell]) -> tuple[dict[str, Sphere], list[CertifiedLen
     return spheres, list(lengths.values())
 
 
-def _require_still_spheres(views: Sequence[SphereView], sessions: Sequence[Session], spheres: Mapping[str, Sphere]) -> None:
+def _require_still_spheres(views: Sequence[SphereView], spheres: Mapping[str, Sphere], folders: Mapping[str, Path]) -> None:
     """Refuse a sphere that was moved between two sessions without a new name: no fit of all its views means anything."""
     first_place: dict[str, FloatArray] = {}
-    for session in sessions:
+    for session in dict.fromkeys(view.session for view in views):
         for name, sphere in spheres.items():
-            starts = [view.start_in_base_mm for view in views if view.sphere == name and view.session == session.digest]
+            starts = [view.start_in_base_mm for view in views if view.sphere == name and view.session == session]
             if not starts:
                 continue
             place = np.median(starts, axis=0)
@@ -172,7 +260,7 @@ def _require_still_spheres(views: Sequence[SphereView], sessions: Sequence[Sessi
             if moved_mm > sphere.radius_mm:
                 raise DataError(
                     f"sphere {name} stands {moved_mm:.0f} mm from where an earlier session shows it",
-                    file=session.folder,
+                    file=folders.get(session),
                     remedy="Verify the sessions apart, or give a moved sphere a name of its own.",
                 )
 
@@ -193,87 +281,6 @@ def _figures_before(
     return figures_of(views_of(observations.shots, place), sizes, line_profile=line_profile)
 
 
-def _length(calibration: JudgedSystem, length: CertifiedLength, figures: Figures, observations: Observations) -> LengthResult:
-    ends = [figures.spheres[name] for name in length.between]
-    measured, scatter = separation(ends[0], ends[1])
-    shots = [[shot for shot in observations.shots if shot.sphere == name] for name in length.between]
-    # few views show little of their scatter by chance, and one shows none
-    scatter = max(scatter, _repeatability_mm(calibration.noise, ends, shots))
-    test = float(np.hypot(scatter, length.standard_uncertainty_mm))
-    predicted = distance_standard_uncertainty_mm(calibration, End(ends[0].centre_in_base_mm, shots[0]), End(ends[1].centre_in_base_mm, shots[1]))
-    total = float(np.hypot(test, predicted))
-    return LengthResult(length.between, measured, length.length_mm, 2.0 * total, test, _why_not_judged(ends, shots))
-
-
-def _repeatability_mm(noise: NoiseModel, ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> float:
-    """Standard uncertainty of a length from the pose noise that the calibration found, each view's share averaged."""
-    variance = 0.0
-    for end, members in zip(ends, shots, strict=True):
-        levers = [np.linalg.norm(end.centre_in_base_mm - shot.base_from_flange[:3, 3]) for shot in members]
-        variance += float(noise.pose_mm**2 + noise.pose_rad**2 * np.mean(np.square(levers))) / len(members)
-    return float(np.sqrt(variance))
-
-
-def _why_not_judged(ends: Sequence[SphereFigures], shots: Sequence[Sequence[SphereShot]]) -> str | None:
-    if any(end.n_views < _LEAST_VIEWS for end in ends):
-        return f"an end with fewer than {_LEAST_VIEWS} views shows no scatter"
-    if _same_poses(shots[0], shots[1]) or _same_poses(shots[1], shots[0]):
-        return "both ends were seen from the same robot poses, which cannot show an error of robot or hand-eye"
-    return None
-
-
-def _same_poses(first: Sequence[SphereShot], second: Sequence[SphereShot]) -> bool:
-    """Whether most shots of one end repeat a flange pose of the other."""
-    poses = np.stack([shot.base_from_flange for shot in second])
-    repeated = [bool(_near(shot.base_from_flange, poses).any()) for shot in first]
-    return float(np.mean(repeated)) > 0.5
-
-
-def _near(pose: FloatArray, others: FloatArray) -> FloatArray:
-    step = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1)
-    turn = np.linalg.norm(se3.log_so3(np.swapaxes(others[:, :3, :3], -1, -2) @ pose[:3, :3]), axis=1)
-    return np.asarray((step < _SAME_POSE_MM) & (turn < _SAME_POSE_RAD))
-
-
 def _length_errors(figures: Figures, lengths: Sequence[CertifiedLength]) -> dict[str, float]:
     known = [length for length in lengths if set(length.between) <= set(figures.spheres)]
     return {"-".join(x.between): separation(figures.spheres[x.between[0]], figures.spheres[x.between[1]])[0] - x.length_mm for x in known}
-
-
-def _judgements(limits: Limits, figures: Figures, lengths: Sequence[LengthResult], spheres: Mapping[str, Sphere]) -> tuple[Judgement, ...]:
-    found: list[Judgement] = []
-    if figures.centre_rms_mm is not None:
-        freedom = 3 * sum(s.n_views - 1 for s in figures.spheres.values())
-        found.append(judge("centre rms", figures.centre_rms_mm, limits.centre_rms_mm, figures.centre_rms_mm / np.sqrt(2 * freedom)))
-    for length in lengths:
-        if length.not_judged is None:
-            found.append(judge(f"length {length.label}", length.error_mm, limits.length_error_mm, length.test_standard_uncertainty_mm))
-    for name, sphere in figures.spheres.items():
-        certificate = spheres[name].expanded_uncertainty_mm / 2
-        u = float(np.hypot(sphere.diameter_standard_uncertainty_mm, certificate))
-        found.append(judge(f"diameter of sphere {name}", sphere.diameter_error_mm, limits.diameter_error_mm, u))
-        found.append(judge(f"form of sphere {name}", sphere.form_mm, limits.form_mm, (spheres[name].form_mm or 0.0) / 2))
-    return tuple(found)
-
-
-def _gaps(limits: Limits | None, figures: Figures, lengths: Sequence[LengthResult], *, line_profile: bool, trained: bool) -> list[str]:
-    """What keeps a verdict from being `conform` whatever the figures say."""
-    gaps = ["shots of the calibration itself were used: the figures flatter"] if trained else []
-    if limits is None:
-        gaps.append("no limits given")
-    if figures.centre_rms_mm is None and not line_profile:
-        gaps.append("no sphere was seen twice: the scatter of centres is unknown")
-    gaps += [f"length {length.label} not judged: {length.not_judged}" for length in lengths if length.not_judged]
-    if not lengths:
-        gaps.append("no certified length was measured: scale and shape of the base are not tested")
-    return gaps
-
-
-def _flattering(trained: Sequence[tuple[Session, int]]) -> DataError:
-    session, index = trained[0]
-    return DataError(
-        f"{len(trained)} shots are those that the calibration was made from, so they prove nothing",
-        file=session.folder,
-        where=f"shot {index}",
-        remedy="Verify on other shots; --allow-training-data shows the figures with that remark.",
-    )

@@ -7,45 +7,15 @@ from dataclasses import dataclass, field
 from acquire.cell import Limits
 from calibrate.observations import Observations, RejectedShot
 from measure.decision import GUARD_FACTOR, RULE, Judgement, Verdict
+from measure.proof.lengths import LengthResult
+from measure.proof.probing import Probing, ProbingResult
+from measure.proof.reach import OutsideShot
+from measure.proof.volume import VolumeFigures
 from measure.sphere_figures import Figures, SphereFigures
 
-SHAPED_ON = "shaped on the sphere tests of VDI/VDE 2634 (probing error, sphere spacing error); no conformity is claimed"
-
-
-@dataclass(frozen=True, slots=True)
-class LengthResult:
-    """One certified length, measured between centres fitted on all views of each sphere together."""
-
-    between: tuple[str, str]
-    measured_mm: float
-    reference_mm: float
-    expanded_uncertainty_mm: float
-    """Of the measured value, k = 2: calibration, scatter between the views, reference."""
-    test_standard_uncertainty_mm: float
-    """Reference and scatter alone: what the decision is charged with."""
-    not_judged: str | None = None
-    """Why this length says nothing about the system; None where it does."""
-
-    @property
-    def error_mm(self) -> float:
-        """Measured minus reference."""
-        return self.measured_mm - self.reference_mm
-
-    @property
-    def label(self) -> str:
-        """For people."""
-        return "-".join(self.between)
-
-    def to_json_dict(self) -> dict[str, object]:
-        """As in DESIGN 4, and whether it was judged."""
-        return {
-            "between": list(self.between),
-            "measured_mm": self.measured_mm,
-            "reference_mm": self.reference_mm,
-            "error_mm": self.error_mm,
-            "expanded_uncertainty_mm": self.expanded_uncertainty_mm,
-            "not_judged": self.not_judged,
-        }
+SHAPED_ON = "shaped on VDI/VDE 2634-3 and ISO 10360-13 (probing error, sphere spacing error); no conformity to either is claimed"
+TRAINING_REMARK = "TRAINING DATA USED (--allow-training-data): this proves nothing"
+"""Printed on every page of a verification that took shots or poses of the calibration itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +47,19 @@ class VerifyResult:
     held_out: bool
     """False where training data were allowed: then the figures flatter."""
     seconds: float
+    probing: tuple[ProbingResult, ...] = ()
+    """Form and size: every sphere over all its views, then every view; empty for line profiles."""
+    volume: VolumeFigures | None = None
+    """All judged lengths together; None without any."""
+    outside: tuple[OutsideShot, ...] = ()
+    """Shots beyond the camera volume or axis ranges that the calibration saw."""
+    warnings: tuple[str, ...] = ()
+    """What a reader must know of these figures besides the verdict's reasons."""
+
+    @property
+    def slides(self) -> tuple[LengthResult, ...]:
+        """Lengths along which one sphere was moved on a slide."""
+        return tuple(length for length in self.lengths if length.is_slide)
 
     @property
     def n_shots(self) -> int:
@@ -107,7 +90,11 @@ class VerifyResult:
             "centre_max_mm": self.figures.centre_max_mm,
             "radial_rms_mm": self.figures.radial_rms_mm,
             "lengths": [length.to_json_dict() for length in self.lengths],
-            "spheres": {name: _sphere_json(sphere) for name, sphere in self.figures.spheres.items()},
+            "spheres": {name: _sphere_json(sphere, self._probing_of(name)) for name, sphere in self.figures.spheres.items()},
+            "volume": None if self.volume is None else self.volume.to_json_dict(),
+            "probing": [self._view_json(p) for p in self.probing if p.session is not None],
+            "outside": [{"session": self.session_name(s.session), "index": s.index, "sphere": s.sphere, "what": list(s.what)} for s in self.outside],
+            "warnings": list(self.warnings),
             "verdict": self.verdict,
             "reasons": list(self.reasons),
             "before": None if self.before is None else _before_json(self.before, self.before_length_errors_mm),
@@ -116,15 +103,26 @@ class VerifyResult:
             "decision_rule": RULE,
             "procedure": SHAPED_ON,
             "held_out": self.held_out,
+            **({} if self.held_out else {"remark": TRAINING_REMARK}),
             "calibration": self.calibration_id,
             "sessions": [{"name": s.name, "digest": s.digest} for s in self.sessions],
             "seconds": self.seconds,
         }
 
+    def _probing_of(self, sphere: str) -> Probing | None:
+        return next((p.probing for p in self.probing if p.sphere == sphere and p.session is None), None)
 
-def _sphere_json(sphere: SphereFigures) -> dict[str, object]:
+    def _view_json(self, view: ProbingResult) -> dict[str, object]:
+        probing = None if view.probing is None else view.probing.to_json_dict()
+        return {"session": self.session_name(str(view.session)), "index": view.index, "sphere": view.sphere, "probing": probing}
+
+
+def _sphere_json(sphere: SphereFigures, probing: Probing | None) -> dict[str, object]:
     return {
         "diameter_error_mm": sphere.diameter_error_mm,
+        "diameter_standard_uncertainty_mm": sphere.diameter_standard_uncertainty_mm,
+        "form_standard_uncertainty_mm": sphere.form_standard_uncertainty_mm,
+        "probing": None if probing is None else probing.to_json_dict(),
         "diameter_error_less_offset_mm": sphere.diameter_error_less_offset_mm,
         "form_mm": sphere.form_mm,
         "form_all_mm": sphere.form_all_mm,

@@ -36,6 +36,8 @@ class TrainedOn:
     """A shot that a system was made from."""
 
     scan_sha256: str
+    joints_rad: FloatArray | None = None
+    base_from_flange: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class TrueSystem:
     sigma_of_radius_mm: float = 0.0
     noise: NoiseModel = NEXT_TO_NO_NOISE
     temperatures_c: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    camera_seen_volume_mm: FloatArray = field(default_factory=lambda: np.array([[-500.0, -500.0, 100.0], [500.0, 500.0, 900.0]]))
+    seen_joints_rad: FloatArray | None = None
+    sphere_centres_in_base_mm: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def model(self) -> RobotModel | None:

@@ -13,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
-from measure.sphere_figures import SphereSize, SphereView, figures_of, separation, shell_width_mm
+from measure.proof.probing import shell_width_mm
+from measure.sphere_figures import SphereSize, SphereView, figures_of, separation
 from tests.support.sphere_views import view
 
 CENTRE_A = np.array([900.0, 100.0, 300.0])
