@@ -250,7 +250,7 @@ def _merged(cells: Sequence[Cell]) -> tuple[dict[str, Sphere], list[CertifiedLen
 def _require_still_spheres(views: Sequence[SphereView], spheres: Mapping[str, Sphere], folders: Mapping[str, Path]) -> None:
     """Refuse a sphere that was moved between two sessions without a new name: no fit of all its views means anything."""
     first_place: dict[str, FloatArray] = {}
-    for session in dict.fromkeys(view.session for view in views):
+    for session in dict.fromkeys((*folders, *(view.session for view in views))):
         for name, sphere in spheres.items():
             starts = [view.start_in_base_mm for view in views if view.sphere == name and view.session == session]
             if not starts:
