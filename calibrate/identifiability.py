@@ -14,6 +14,7 @@ import numpy as np
 
 from calibrate.camera_error import FreeCrossing
 from calibrate.clouds import Solution
+from calibrate.distinct_views import most_rank
 from calibrate.gauge import ANGLE_SCALE_MM, OpenDirections, camera_gauge_twists, named_directions, parameter_scale
 from calibrate.normal import symmetric_inverse
 from calibrate.problem import Layout, Problem
@@ -88,7 +89,7 @@ class Identifiability:
             "rank": self.rank,
             "expected_rank": self.expected_rank,
             "n_parameters": self.n_parameters,
-            "condition": self.condition,
+            "condition": self.condition if np.isfinite(self.condition) else None,
             "gap": self.gap if np.isfinite(self.gap) else None,
             "observability": None if self.observability is None else asdict(self.observability),
             "singular_values": self.singular_values.tolist(),
@@ -119,13 +120,16 @@ def identifiability_of(problem: Problem, solution: Solution) -> Identifiability:
     values, vectors = np.linalg.eigh(_projected_information(problem, solution) / scale[:, None] / scale)
     values, vectors = values[::-1], vectors[:, ::-1]
     rank = int((values > _RELATIVE_ZERO * values[0]).sum())
+    if problem.along_sight and problem.n_shots and problem.external is None:
+        # repeats of a pose differ by noise: each would seem to tell a little more
+        rank = min(rank, most_rank(problem))
     singular = np.sqrt(np.maximum(values, 0.0))
     return Identifiability(
         rank=rank,
         n_parameters=n,
         expected_rank=(4 * layout.n_links if layout.n_links else 6) + layout.n_camera - camera_gauge(problem) - _held_by_prior(problem),
-        condition=float(singular[0] / singular[rank - 1]),
-        gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if rank < n else float("inf"),
+        condition=float(singular[0] / singular[rank - 1]) if rank else float("inf"),
+        gap=float(singular[rank - 1] / max(singular[rank], 1e-300)) if 0 < rank < n else float("inf"),
         singular_values=singular,
         observability=observability_of(singular[:rank], problem.n_shots),
         directions=named_directions(problem, solution.state, vectors[:, rank:], (vectors * values) @ vectors.T),

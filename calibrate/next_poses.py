@@ -16,6 +16,7 @@ from calibrate.clouds import Solution
 from calibrate.design import choose_shots, information_of
 from calibrate.design_cell import PlacedLength, PlacedSphere, aim_of_cell, scene_of
 from calibrate.design_shots import Expectation, IntArray
+from calibrate.distinct_views import count_distinct_views
 from calibrate.problem import Problem
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics import se3
@@ -53,10 +54,11 @@ def shortcomings(problem: Problem, solution: Solution, expected_rank: int) -> tu
     """What the shots of a problem are too few or too alike in, with what to do; empty where nothing stands out."""
     found = []
     n_sought = expected_rank + 3 * len(problem.radius_mm) - len(problem.lengths)
-    if 3 * problem.n_shots < n_sought:
-        found.append(
-            f"too few shots: {problem.n_shots} for {n_sought} unknowns, each tells three numbers; take {max(_ENOUGH_SHOTS, n_sought)} or more"
-        )
+    n_views = count_distinct_views(problem)
+    if 3 * n_views < n_sought:
+        few, poses = f"{problem.n_shots}", f"{n_views} distinct pose{'s' * (n_views != 1)}"
+        what = f"too few shots: {few}" if n_views == problem.n_shots else f"too few poses: the {few} shots are of {poses} only,"
+        found.append(f"{what} for {n_sought} unknowns, each tells three numbers; take {max(_ENOUGH_SHOTS, n_sought)} or more")
     if not problem.n_shots:
         return tuple(found)
     seen = solution.geometry.centre_in_camera_mm

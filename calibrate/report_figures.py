@@ -74,6 +74,8 @@ def make_result(
     external_rms, external_predicted = rms_mm(solved.external_held_out_mm), predicted_rms_mm(solution)
     if np.isfinite(external_rms):
         scale = max(scale, (external_rms / external_predicted) ** 2)
+    if solved.misfit is not None:
+        scale *= solved.misfit.covariance_factor(_spread_mm2(problem, solution))
     identifiability = identifiability_of(problem, solution)
     names = assembled.sphere_names
     covariance = solution.covariance * scale
@@ -144,6 +146,7 @@ def make_result(
         external_rms_mm=external_rms if np.isfinite(external_rms) else None,
         shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
         unseen_branch=unseen_branch(problem, solution, covariance),
+        camera_misfit=solved.misfit,
     )
     verdict, reasons = judge(evidence, identifiability)
     next_poses = _next_poses(cell, assembled, solution) if wants_more_poses(evidence, identifiability) else ()
@@ -180,6 +183,8 @@ def _next_poses(cell: Cell, assembled: Assembled, solution: Solution) -> tuple[P
     problem, state = assembled.problem, solution.state
     if problem.model is None or problem.joints_rad is None or not problem.n_shots:
         return ()
+    if solution.held and cell.flange_from_camera is None:
+        return ()  # nobody knows where the camera looks
     taken = Taken(
         joints_rad=problem.joints_rad,
         sphere=problem.sphere,
@@ -197,6 +202,12 @@ def _predicted_centre_rms(assembled: Assembled, solution: Solution) -> float:
     covariance, sensitivity = shot_centre_covariance_mm2(problem, solution)
     spread = sensitivity @ solution.covariance @ np.swapaxes(sensitivity, -1, -2)
     return float(np.sqrt(np.trace(covariance + spread, axis1=1, axis2=2).mean()))
+
+
+def _spread_mm2(problem: Problem, solution: Solution) -> float:
+    """Variance of a shot's centre, all axes together, that the unknowns' own brings about; mean over the shots."""
+    _, sensitivity = shot_centre_covariance_mm2(problem, solution)
+    return float(np.einsum("mip,pq,miq->m", sensitivity, solution.covariance, sensitivity, optimize=True).mean())
 
 
 def _over_work_volume(result: Calibration, cell: Cell) -> bool:
