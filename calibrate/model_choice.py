@@ -51,7 +51,7 @@ class Choice:
 
 def is_open(models: Sequence[CameraError], problem: Problem) -> bool:
     """Whether the data have a say in the model: several to compare, a smoothness or a sight crossing to be found."""
-    return problem.along_sight and (len(models) > 1 or len(_variants_of(models[0])) > 1 or isinstance(models[0], FreeCrossing))
+    return problem.along_sight and (len(models) > 1 or len(variants_of(models[0])) > 1 or isinstance(models[0], FreeCrossing))
 
 
 def choose_model(solution: Solution, models: Sequence[CameraError]) -> Choice:
@@ -64,7 +64,7 @@ def choose_model(solution: Solution, models: Sequence[CameraError]) -> Choice:
     if isinstance(models[-1], FreeCrossing):
         found, state = find_crossing(solution)
         return Choice(found, state, {})
-    tried = try_families(solution, [_variants_of(model) for model in models])
+    tried = try_families(solution, [variants_of(model) for model in models])
     chosen = tried[simplest_of_the_best([one.squared_errors_mm2 for one in tried])]
     return Choice(chosen.model, chosen.state, {one.model.name: one.rms_mm for one in tried} if len(tried) > 1 else {})
 
@@ -101,6 +101,12 @@ def simplest_of_the_best(errors_mm2: Sequence[FloatArray]) -> int:
     return best
 
 
+def capped_rms_mm(errors_mm2: Sequence[FloatArray]) -> list[float]:
+    """Held-out rms of each model, errors (m,) capped as where models are compared."""
+    cap = _cap(errors_mm2)
+    return [float(np.sqrt(np.minimum(error, cap).mean())) for error in errors_mm2]
+
+
 def _best_of(family: Sequence[CameraError], solution: Solution, folds: Folds, stacked: StackedModels) -> Tried:
     # variants of a family leave much the same pose noise, so that the middle one speaks for all
     noise = noise_of(folds, stacked.columns_of(family[len(family) // 2]), solution.noise)
@@ -132,7 +138,8 @@ def _cap(errors_mm2: Sequence[FloatArray]) -> float:
     return _TYPICAL_CAP * min(float(np.median(error)) for error in errors_mm2)
 
 
-def _variants_of(model: CameraError) -> tuple[CameraError, ...]:
+def variants_of(model: CameraError) -> tuple[CameraError, ...]:
+    """Models of the same kind among which held-out shots choose."""
     if isinstance(model, PolynomialError) and model.name == "field":
         return field_variants((model.centre_mm, model.half_size_mm))
     return (model,)

@@ -131,7 +131,7 @@ def make_result(
         limits=cell.limits,
         cross_validated_rms_mm=held_out_rms,
         length_expanded_uncertainty_mm=_length_uncertainty(result, cell, assembled, solution),
-        over_work_volume=_over_work_volume(result, cell),
+        length_place=_length_place(assembled, cell, result),
         n_shots=n_shots,
         used=used,
         has_joints=has_joints,
@@ -210,16 +210,19 @@ def _spread_mm2(problem: Problem, solution: Solution) -> float:
     return float(np.einsum("mip,pq,miq->m", sensitivity, solution.covariance, sensitivity, optimize=True).mean())
 
 
-def _over_work_volume(result: Calibration, cell: Cell) -> bool:
-    return result.model is not None and cell.work_volume_mm is not None
+def _length_place(assembled: Assembled, cell: Cell, result: Calibration) -> str:
+    """Where the length is that `_length_uncertainty` tells of."""
+    if result.model is not None and cell.work_volume_mm is not None:
+        return "over the work volume"
+    return "between sphere places" if len(assembled.sphere_names) > 1 else "about the only sphere place"
 
 
 def _length_uncertainty(result: Calibration, cell: Cell, assembled: Assembled, solution: Solution) -> float | None:
-    """Expanded uncertainty (k = 2) of the least certain length over the work volume; without one, between sphere places."""
-    volume = cell.work_volume_box_mm
-    if volume is None or result.model is None:
+    """Expanded uncertainty (k = 2) of the least certain length over the work volume; without one, between sphere places or about the only one."""
+    n_spheres = len(assembled.sphere_names)
+    if result.model is None or not n_spheres or (cell.work_volume_mm is None and n_spheres > 1):
         return _longest_length_uncertainty(assembled, solution, result.covariance)
-    return volume_length_uncertainty_mm(result, volume)
+    return volume_length_uncertainty_mm(result, work_box_mm(cell, solution.state.centres_in_base_mm))
 
 
 def _longest_length_uncertainty(assembled: Assembled, solution: Solution, covariance: FloatArray) -> float | None:

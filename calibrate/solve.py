@@ -16,6 +16,7 @@ from acquire.cell import Cell, cell_of_session, robot_model_of
 from acquire.check import check_session
 from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
+from calibrate.camera_misfit import CameraMisfit, misfit_of
 from calibrate.centres import cross_validate_centres, require_centres, solve_centres
 from calibrate.clouds import Solution, solve_clouds, thinned
 from calibrate.distinct_views import held_by_priors, is_starved
@@ -75,6 +76,8 @@ class Solved:
     rejected: tuple[RejectedShot, ...]
     external_held_out_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(E, 3) error of every external point against a solve without it; see `held_out_errors`."""
+    misfit: CameraMisfit | None = None
+    """Of a camera error model that was asked for against the data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +109,7 @@ def calibrate(sessions: Sequence[Session], settings: CalibrationSettings | None 
 def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Calibration:
     began = time.perf_counter()
     cell, model = cell_of_sessions(sessions)
-    cell, warmth = cell_when_seen(cell, sessions)
+    cell, warmth = cell_when_seen(cell, sessions, uses_lengths=settings.method != "stepwise")
     notes = check_reported_poses(sessions, model) + warmth
     observations = see_sessions(sessions, cell=cell, model=model)
     if model is not None and observations.external and not _show_spheres(sessions):
@@ -194,6 +197,17 @@ def solve_observations(
     observations: Observations, cell: Cell, model: RobotModel | None, settings: CalibrationSettings
 ) -> tuple[Solved, dict[str, float]]:
     """Solve with the camera error model asked for, or with the simplest that held-out shots do not tell from the best."""
+    solved, compared = _solved_by_method(observations, cell, model, settings)
+    asked = settings.camera_error != "auto" and settings.method in _SOLVERS
+    if not asked or not solved.solution.problem.along_sight or solved.solution.held:
+        return solved, compared
+    others = _candidates(observations, cell, replace(settings, camera_error="auto"))
+    return replace(solved, misfit=misfit_of(solved.solution, others)), compared
+
+
+def _solved_by_method(
+    observations: Observations, cell: Cell, model: RobotModel | None, settings: CalibrationSettings
+) -> tuple[Solved, dict[str, float]]:
     if settings.method == "stepwise":
         from calibrate.stepwise_sessions import solve_stepwise_sessions
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from acquire.cell import Limits
 from calibrate.arm_branches import UnseenBranch
+from calibrate.camera_misfit import CameraMisfit
 from calibrate.identifiability import Identifiability
 
 _MANY_REJECTED, _TOO_MANY_REJECTED = 0.1, 0.4
@@ -23,15 +24,15 @@ class Evidence:
     limits: Limits | None
     cross_validated_rms_mm: float
     length_expanded_uncertainty_mm: float | None
-    """k = 2, of the least certain length over the work volume; where none is stated, between the farthest sphere places."""
+    """k = 2, of the least certain length over the work volume; where none is stated, between the farthest sphere places or about the only one."""
     n_shots: int
     used: int
     has_joints: bool
     has_certified_length: bool
     line_profile: bool
     covariance_scale: float
-    over_work_volume: bool = False
-    """Whether the length is one of the work volume."""
+    length_place: str = "between sphere places"
+    """Where that length is, in words."""
     external_rms_mm: float | None = None
     """Rms of held-out external points; None without any."""
     shortcomings: tuple[str, ...] = ()
@@ -44,6 +45,8 @@ class Evidence:
     """Whether the method takes no certified length, even where one was seen."""
     point_noise_mm: float = 0.0
     """Of one point along its normal."""
+    camera_misfit: CameraMisfit | None = None
+    """What the camera error model that was asked for leaves and another explains."""
     unseen_branch: UnseenBranch | None = None
     """The best known of the arm's other branches where all shots are of one."""
 
@@ -119,16 +122,23 @@ def _doubts(e: Evidence) -> list[str]:
     if e.limits is None:
         found.append("no limits given in the cell file: there is nothing to pass against")
     elif _unsure_length(e):
-        where = "over the work volume" if e.over_work_volume else "between sphere places"
-        found.append(f"a length {where} has U = {e.length_expanded_uncertainty_mm:.3f} mm, above the limit of {e.limits.length_error_mm:g} mm")
+        length, limit = e.length_expanded_uncertainty_mm, e.limits.length_error_mm
+        found.append(f"a length {e.length_place} has U = {length:.3f} mm, above the limit of {limit:g} mm")
     if e.has_joints and not e.has_certified_length:
         lacking = "the method stepwise uses no certified length" if e.ignores_lengths else "no certified length was seen"
-        found.append(f"{lacking}: the scale over the volume rests on sphere diameters and depth alone")
+        length, said = e.length_expanded_uncertainty_mm, _unsure_length(e)
+        how_far = "" if length is None or said else f"; a length {e.length_place} has U = {length:.3f} mm"
+        found.append(f"{lacking}: the scale over the volume rests on sphere diameters and depth alone{how_far}")
     if abs(e.radius_offset_mm) > _LARGE_OFFSET_MM:
         more = "larger" if e.radius_offset_mm > 0 else "smaller"
         found.append(f"the spheres read {abs(e.radius_offset_mm):.2f} mm {more} in radius than certified: check diameter_mm in the cell file")
     if _MANY_REJECTED < 1 - e.used / max(e.n_shots, 1) <= _TOO_MANY_REJECTED:
         found.append(f"{e.n_shots - e.used} of {e.n_shots} shots were rejected")
-    if e.has_joints and e.covariance_scale > 4.0:
+    if e.camera_misfit is not None:
+        found.append(
+            f"the camera error model asked for misses shots left out by {e.camera_misfit.rms_mm:.3f} mm, the model {e.camera_misfit.better} by "
+            f"{e.camera_misfit.better_rms_mm:.3f} mm: uncertainties are widened for it; --camera-error auto needs no such widening"
+        )
+    elif e.has_joints and e.covariance_scale > 4.0:
         found.append(f"held-out shots miss by {np.sqrt(e.covariance_scale):.1f} times what the noise explains: something is not in the model")
     return found
