@@ -113,10 +113,11 @@ def artefact_when_seen(
     return Artefact({name: sphere for name, (sphere, _) in of_spheres.items()}, tuple(length for length, _ in of_lengths), notes)
 
 
-def cell_when_seen(cell: Cell, sessions: Sequence[Session]) -> tuple[Cell, tuple[str, ...]]:
-    """The cell with sizes for one solve of these sessions (see `artefact_when_seen`), and notes."""
+def cell_when_seen(cell: Cell, sessions: Sequence[Session], *, uses_lengths: bool = True) -> tuple[Cell, tuple[str, ...]]:
+    """The cell with sizes for one solve of these sessions (see `artefact_when_seen`), and notes of those that the solve uses."""
     artefact = artefact_when_seen(cell.spheres, cell.lengths, sessions, used_together=True)
-    return cell.model_copy(update={"spheres": artefact.spheres, "lengths": artefact.lengths}), artefact.notes
+    notes = artefact.notes if uses_lengths else artefact_when_seen(cell.spheres, (), sessions).notes
+    return cell.model_copy(update={"spheres": artefact.spheres, "lengths": artefact.lengths}), notes
 
 
 def temperature_ranges_c(sessions: Sequence[Session]) -> dict[str, tuple[float, float]]:

@@ -49,6 +49,10 @@ def test_it_is_held_out_and_its_covariance_says_what_it_misses(stepwise: Calibra
     assert (statistics.rank, statistics.n_parameters) == (27, 45)
 
 
+def test_what_one_sphere_leaves_of_a_length_is_told_without_work_volume_or_limits(stepwise: Calibration) -> None:
+    assert any("uses no certified length" in reason and "about the only sphere place has U = " in reason for reason in stepwise.reasons), stepwise.reasons
+
+
 def test_whole_clouds_predict_unseen_shots_better(stepwise: Calibration, session: Path) -> None:
     clouds = calibrate([read_session(session)], CalibrationSettings(camera_error="pillow"))
     assert clouds.method == "clouds"

@@ -198,6 +198,12 @@ def test_a_warm_bar_gives_the_right_scale_only_with_its_correction(calibrations:
     assert not any("corrected to" in reason for reason in calibrations["as certified"].reasons)
 
 
+def test_a_method_that_uses_no_length_corrects_none(tmp_path: Path) -> None:
+    session = bar_session(tmp_path / "s", shots_of_bar(20, 3), [{"artefact": 25.0}], STEEL)
+    found = calibrate([session], CalibrationSettings(method="stepwise", camera_error="none"))
+    assert not any("lengths corrected" in reason for reason in found.reasons), found.reasons
+
+
 def test_the_file_holds_the_temperatures_seen(calibrations: Mapping[str, Calibration], tmp_path: Path) -> None:
     calibrations["corrected"].save(tmp_path / "c.yaml")
     assert Calibration.load(tmp_path / "c.yaml").temperatures_c == {"artefact": (25.0, 25.0), "housing": (34.0, 34.0)}
