@@ -151,7 +151,8 @@ def shot_centre_covariance_mm2(problem: Problem, solution: Solution) -> tuple[Fl
     The second result (m, 3, P) is the motion of the shot's fixed-radius centre, less its sphere's, per unknown.
     """
     weight = solution.noise.point_weight(np.diff(problem.starts).astype(np.float64))
-    return _covariance_and_sensitivity(solution.geometry, solution.moments, np.linalg.inv(solution.moments[:, :3, :3]), weight, solution.noise)
+    inverse = np.asarray(np.linalg.inv(solution.moments[:, :3, :3]))
+    return _covariance_and_sensitivity(solution.geometry, solution.moments, inverse, weight, solution.noise)
 
 
 def judge_arcs(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -165,7 +166,7 @@ def judge_arcs(problem: Problem, solution: Solution) -> tuple[FloatArray, FloatA
     geometry = linearise_geometry(problem, state)
     moments, _ = shot_moments(problem, state, geometry, np.inf)
     weight = solution.noise.point_weight(np.diff(problem.starts).astype(np.float64))
-    inverse = np.linalg.inv(moments[:, :3, :3] + (_OPEN_MM**-2 / weight)[:, None, None] * np.eye(3))
+    inverse = np.asarray(np.linalg.inv(moments[:, :3, :3] + (_OPEN_MM**-2 / weight)[:, None, None] * np.eye(3)))
     miss = (geometry.base_from_camera[:, :3, :3] @ (inverse @ moments[:, :3, -1:]))[..., 0]
     directions = np.einsum("mij,mji->m", inverse, moments[:, :3, :3])
     return miss, *_covariance_and_sensitivity(geometry, moments, inverse, weight, solution.noise), directions
