@@ -13,6 +13,7 @@ from drivers.errors import FileError
 _POINT = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _COMMA = re.compile(r"[-+]?(?:[0-9]+,[0-9]*|,[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _DELIMITERS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "blanks"}
+_NO_TEXT = {"json": "from JSON"}
 _COMMENTS = ("#", "%", "//")
 _MOST_LINES = 100_000
 _MOST_CHARACTERS = 20_000
@@ -41,11 +42,15 @@ class Table:
     def described(self) -> str:
         """How the text was read, in words."""
         parts = [
-            f"separated by {_DELIMITERS[self.delimiter]}",
+            _NO_TEXT.get(self.delimiter) or f"separated by {_DELIMITERS[self.delimiter]}",
             "with decimal commas" if self.decimal_comma else "",
             "" if self.header else "no header",
         ]
         return ", ".join(part for part in parts if part)
+
+    def where(self, row: int) -> str:
+        """The place of a row in its file, for messages."""
+        return f"{'pose' if self.delimiter in _NO_TEXT else 'line'} {self.lines[row]}"
 
     def number(self, cell: str) -> float | None:
         """The number in a cell; None where there is none."""

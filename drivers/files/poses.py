@@ -1,4 +1,4 @@
-"""A list of poses from any file that is read: a table, RAPID targets, or a URScript; told apart by its content."""
+"""A list of poses from any file that is read: a table, JSON, RAPID targets, or a URScript; told apart by its content."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 from drivers.errors import FileError
 from drivers.files.disk import read_bytes
 from drivers.files.pose_list import PoseList
-from drivers.files.poses_csv import parse_pose_table
+from drivers.files.poses_csv import parse_pose_table, poses_of_table
+from drivers.files.poses_json import is_json, parse_json_table
 from drivers.files.rapid_targets import is_rapid, parse_rapid_poses
 from drivers.files.ur_waypoints import is_ur_script, parse_ur_poses
 
@@ -38,13 +39,17 @@ def parse_poses(text: str, *, file: str | Path, columns: Sequence[str] | None = 
         use: axis angles alone, poses alone, or both, where both stand there.
 
     Raises:
-        FileError: as the readers of the three kinds, or what is to be used is not there.
+        FileError: as the readers of the kinds, or what is to be used is not there.
     """
     if columns is None and is_rapid(text):
         return _finite(parse_rapid_poses(text, file=file, use=use))
-    if columns is None and is_ur_script(text):
+    json = is_json(text)
+    if columns is None and not json and is_ur_script(text):
         return _finite(parse_ur_poses(text, file=file, use=use))
-    found = parse_pose_table(text, file=file, columns=columns)
+    if json:
+        found = poses_of_table(parse_json_table(text, file=file), file=file, columns=columns)
+    else:
+        found = parse_pose_table(text, file=file, columns=columns)
     if use == "joints":
         found = replace(found, positions=None, rotations=None)
     if use == "poses":

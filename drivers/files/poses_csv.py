@@ -26,17 +26,21 @@ _Key = tuple[Kind, int]
 
 
 def parse_pose_table(text: str, *, file: str | Path, columns: Sequence[str] | None = None) -> PoseList:
+    """The poses of a text that holds a table; see `poses_of_table`."""
+    return poses_of_table(parse_table(text, file=file), file=file, columns=columns)
+
+
+def poses_of_table(table: Table, *, file: str | Path, columns: Sequence[str] | None = None) -> PoseList:
     """The poses of a table.
 
     Args:
-        text: the file's text.
+        table: cells of text.
         file: only named in errors.
         columns: names of the columns in their order, instead of the header's.
 
     Raises:
-        FileError: no table, columns that are missing, doubled or not understood, or a cell that holds no number.
+        FileError: columns that are missing, doubled or not understood, or a cell that holds no number.
     """
-    table = parse_table(text, file=file)
     names, told = _names(table, columns, file)
     meaning = columns_of(names)
     reader = _Reader(table, names, meaning, _places(meaning, names, file), str(file))
@@ -106,7 +110,7 @@ class _Reader:
         value = None if number is None else self.table.number(number)
         whole = int(value) if value is not None and value == int(value) and abs(value) < 1e9 else None
         texts = (self._cell(row, "cloud"), self._cell(row, "sphere"), self._cell(row, "time"))
-        return PoseLabel(f"line {self.table.lines[row]}", self._cell(row, "name"), whole, *texts)
+        return PoseLabel(self.table.where(row), self._cell(row, "name"), whole, *texts)
 
     def _cell(self, row: int, kind: Kind) -> str | None:
         place = self.places.get((kind, 0))
@@ -117,7 +121,7 @@ class _Reader:
         value = self.table.number(cell)
         if value is None:
             message = f"{self.names[column]}: {cell[:40]!r} is no finite number"
-            raise FileError(message, file=self.file, where=f"line {self.table.lines[row]}", remedy="Correct it, or delete the line.")
+            raise FileError(message, file=self.file, where=self.table.where(row), remedy="Correct it, or leave the pose out.")
         return value
 
     def _unit(self, kind: Kind, allowed: tuple[str, ...]) -> str | None:
