@@ -20,6 +20,7 @@ from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
 from measure.cli_export import export
 from measure.cli_import import import_session
+from measure.cli_jobs import jobs
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
 from measure.cli_predict import predict
@@ -67,6 +68,7 @@ VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
 """Name, function, and what the list of commands says of it: whole where longer helps would be cut off."""
 
 app.add_typer(new, name="new")
+app.add_typer(jobs, name="jobs", short_help="Measure parts unattended, one job a part.")
 for name, verb, summary in VERBS:
     app.command(name, short_help=summary)(verb)
 

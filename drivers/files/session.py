@@ -21,7 +21,7 @@ from drivers.files.ply import PointCloud, parse_ply
 from drivers.files.shots import ScanFile, Shot, read_shots
 from drivers.files.yaml import parse_yaml
 
-__all__ = ["ScanFile", "Session", "Shot", "read_head", "read_scan", "read_session"]
+__all__ = ["ScanFile", "Session", "Shot", "read_head", "read_scan", "read_session", "session_digest"]
 
 SESSION_FORMAT = "spherecal-session/1"
 PURPOSES = ("calibration", "verification", "workpiece")
@@ -76,7 +76,7 @@ def read_session(folder: str | Path) -> Session:
         identity=as_mapping(head.get("identity") or {}, file=head.file, where="identity"),
         shots=tuple(shot for shot in shots if shot.index not in replaced),
         all_shots=shots,
-        digest=_digest(folder, cell_path),
+        digest=session_digest(folder, cell_path),
         cell_path=cell_path,
         robot_model_path=_optional(folder / "robot_model.yaml"),
         plan_path=_optional(folder / "plan.yaml"),
@@ -133,7 +133,8 @@ def _optional(path: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def _digest(folder: Path, cell_path: Path) -> str:
+def session_digest(folder: Path, cell_path: Path) -> str:
+    """What `Session.digest` says, from the bytes alone; FileError where one of the files is missing."""
     files = {"session.yaml": folder / "session.yaml", "cell.yaml": cell_path, "shots.jsonl": folder / "shots.jsonl"}
     files |= {name: folder / name for name in ("plan.yaml", "robot_model.yaml") if (folder / name).exists()}
     return sha256_hex("".join(f"{name} {sha256_hex(read_bytes(path))}\n" for name, path in sorted(files.items())).encode())
