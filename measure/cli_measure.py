@@ -39,6 +39,10 @@ def verify(
 
 def tell_verification(console: Console, result: VerifyResult) -> None:
     """Figures before and after, lengths, verdict and reasons, for a person."""
+    from measure.verify_result import TRAINING_REMARK
+
+    if not result.held_out:
+        console.say(TRAINING_REMARK)
     console.table("", ["on unseen shots, mm", "uncalibrated", "calibrated"], comparison_rows(result))
     rows = [
         [length.label, length.measured_mm, length.reference_mm, f"{length.error_mm:+.3f}", length.expanded_uncertainty_mm, length.not_judged or ""]
@@ -46,8 +50,40 @@ def tell_verification(console: Console, result: VerifyResult) -> None:
     ]
     if rows:
         console.table("lengths, mm", ["between", "measured", "certified", "error", "U (k=2)", "not judged"], rows)
+    tell_probing(console, result)
+    tell_slides(console, result)
     tell_rejected(console, [(result.session_name(shot.session), shot.index, shot.reason) for shot in result.rejected])
+    for warning in result.warnings:
+        console.note(f"warning: {warning}")
     tell_verdict(console, result.verdict, result.reasons)
+
+
+def tell_probing(console: Console, result: VerifyResult) -> None:
+    """Form and size of every sphere over all its views, and of the worst single view."""
+    rows: list[list[object]] = []
+    for name in result.figures.spheres:
+        members = [p for p in result.probing if p.sphere == name and p.probing is not None]
+        together = next((p.probing for p in members if p.session is None), None)
+        single = [p.probing for p in members if p.session is not None and p.probing is not None]
+        if together is not None:
+            rows.append([name, "all views", *together.form_mm, *(f"{size:+.3f}" for size in together.size_error_mm)])
+        if single:
+            worst = max(single, key=lambda p: p.form_mm[2])
+            rows.append([name, "worst view", *worst.form_mm, *(f"{size:+.3f}" for size in worst.size_error_mm)])
+    if rows:
+        heads = ["sphere", "of", "form, all", "99.7 %", "95 %", "size, all", "99.7 %", "95 %"]
+        console.table("probing error of form and size (free radius), mm", heads, rows)
+
+
+def tell_slides(console: Console, result: VerifyResult) -> None:
+    """The paper's slide test, view by view, with what the paper prints beside it."""
+    from measure.proof.slide import CAUTION, slide_rows
+
+    rows = slide_rows(result.slides)
+    if rows:
+        heads = ["slide", "pairs", "mean", "max", "std", "signed mean", "refused"]
+        console.table("slide: | |P1 - P2| - L | view by view, mm", heads, rows)
+        console.say(f"  {CAUTION}")
 
 
 def comparison_rows(result: VerifyResult) -> list[list[object]]:

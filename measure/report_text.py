@@ -10,7 +10,7 @@ from acquire.cell import Limits
 from measure.decision import RULE
 from measure.proof.lengths import LengthResult
 from measure.report_page import CalibrationFacts, Row, Table
-from measure.verify_result import SHAPED_ON, VerifyResult
+from measure.verify_result import SHAPED_ON, TRAINING_REMARK, VerifyResult
 
 NOTHING = "–"
 
@@ -69,7 +69,9 @@ def remarks_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tu
         remarks.append("Simulated cell: these figures come from a model of robot and camera, never from hardware.")
     remarks += [f"The driver {name} has never run on hardware: no signed hardware log is in its documentation." for name in facts.untried_drivers]
     if verification is not None and not verification.held_out:
-        remarks.append("Shots of the calibration itself were used for the verification: the figures flatter.")
+        remarks.append(f"{TRAINING_REMARK}. The figures flatter.")
+    if verification is not None:
+        remarks += [f"{warning[0].upper()}{warning[1:]}." for warning in verification.warnings]
     return tuple(remarks)
 
 
