@@ -45,7 +45,9 @@ class FolderCamera:
     """
 
     def __init__(self, folder: Path, settings: FolderSettings) -> None:
-        self._folder, self._settings = folder, settings
+        self.folder = folder
+        """Where the scans appear."""
+        self._settings = settings
         self._axes = parse_axes(settings.axes)
         self._opened = False
         self._sequence = 0
@@ -87,15 +89,15 @@ class FolderCamera:
             CameraMisconfigured: unit, axes or grid of the cell file do not fit the scan.
         """
         if not self._opened:
-            raise CameraNotReached("the camera's folder is not open", file=self._folder, remedy="Open the camera first.")
+            raise CameraNotReached("the camera's folder is not open", file=self.folder, remedy="Open the camera first.")
         end_s = time.monotonic() + timeout_s
         self._let_late_scan_pass(time.monotonic() + timeout_s / 2)
         before = self._look(CameraLost)
-        path = self._folder / f"spherecal_{time.time_ns()}.ply" if self._settings.names_its_file else None
+        path = self.folder / f"spherecal_{time.time_ns()}.ply" if self._settings.names_its_file else None
         self._unanswered = None if path else before
         triggered_s = time.monotonic()
         self._trigger(path, end_s)
-        watch = Watch(self._folder, self._settings.stable_s)
+        watch = Watch(self.folder, self._settings.stable_s)
         while (arrived := watch.look(path.name if path else self._new_name(before), time.monotonic())) is None:
             if time.monotonic() >= end_s:
                 raise watch.too_late(timeout_s)
@@ -109,20 +111,20 @@ class FolderCamera:
 
     def _look(self, kind: type[CameraNotReached]) -> dict[str, Stamp]:
         try:
-            return snapshot(self._folder, self._settings.patterns)
+            return snapshot(self.folder, self._settings.patterns)
         except OSError as error:
             remedy = "Check `folder` in the cell file's camera section, and whether the share is mounted."
-            raise kind(f"the camera's folder cannot be read ({error.strerror})", file=self._folder, remedy=remedy) from error
+            raise kind(f"the camera's folder cannot be read ({error.strerror})", file=self.folder, remedy=remedy) from error
 
     def _new_name(self, before: dict[str, Stamp]) -> str | None:
         names = new_names(before, self._look(CameraLost))
         if len(names) > 1:
             found = f"{len(names)} files appeared after one trigger: {', '.join(names[:3])}"
-            raise InvalidFrame(found, file=self._folder, remedy="Name the scans alone by `pattern`, and let one trigger give one scan.")
+            raise InvalidFrame(found, file=self.folder, remedy="Name the scans alone by `pattern`, and let one trigger give one scan.")
         return names[0] if names else None
 
     def _let_late_scan_pass(self, end_s: float) -> None:
-        watch = Watch(self._folder, self._settings.stable_s)
+        watch = Watch(self.folder, self._settings.stable_s)
         while self._unanswered is not None and time.monotonic() < end_s:
             late = new_names(self._unanswered, self._look(CameraLost))
             if late and watch.look(late[-1], time.monotonic()) is not None:
@@ -132,15 +134,15 @@ class FolderCamera:
     def _trigger(self, path: Path | None, end_s: float) -> None:
         if self._settings.trigger_file is not None:
             try:
-                write_atomic(self._folder / self._settings.trigger_file, f"{self._sequence + 1}\n".encode())
+                write_atomic(self.folder / self._settings.trigger_file, f"{self._sequence + 1}\n".encode())
             except FileError as error:
                 found = f"the trigger file cannot be written: {error.message}"
                 raise CameraLost(found, file=error.file, remedy="Check the folder's permissions.") from error
         elif self._settings.command is not None:
-            run_trigger([word.replace("{path}", str(path)) for word in self._settings.command], self._folder, end_s - time.monotonic())
+            run_trigger([word.replace("{path}", str(path)) for word in self._settings.command], self.folder, end_s - time.monotonic())
 
     def _frame(self, arrived: Arrived, triggered_s: float) -> Frame3D:
-        path = self._folder / arrived.name
+        path = self.folder / arrived.name
         earlier = self._frames_by_sha256.get(arrived.sha256)
         if earlier is not None:
             remedy = "Let the camera's software export new scans only."

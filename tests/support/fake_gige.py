@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.cameras.genicam.aravis import LOST_CAMERA_THREAD
 from drivers.cameras.genicam.aravis_library import load
 from drivers.errors import CameraSdkMissing
 
@@ -188,12 +187,3 @@ def fake_gige(expose: Callable[[], NDArray[np.float32]]) -> Iterator[FakeGige]:
             yield camera
         finally:
             camera.stop()
-            await_goodbyes()
-
-
-def await_goodbyes() -> None:
-    """A client that lost its camera tries for seconds to tell it so: the next test's camera, at the same address, must not hear that."""
-    for thread in threading.enumerate():
-        if thread.name == LOST_CAMERA_THREAD:
-            thread.join(timeout=20.0)
-            assert not thread.is_alive(), "a lost camera is still being told"

@@ -34,7 +34,7 @@ class VendorSoftware:
     encode: Callable[[Points], bytes] = as_ply
     suffix: str = ".ply"
     pieces: int = 3
-    pause_s: float = 0.03
+    pause_s: float = 0.01
     silent: bool = False
     delay_s: float = 0.0
     n_written: int = 0

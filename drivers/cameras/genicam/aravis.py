@@ -18,6 +18,7 @@ from drivers.cameras.genicam import gvcp
 from drivers.cameras.genicam.aravis_library import NOT_CONTROLLER, TRANSPORT_CODES, AravisError, AravisLibrary, load
 from drivers.cameras.genicam.decode import Part
 from drivers.cameras.genicam.pfnc import name_of
+from drivers.cameras.genicam.receive_buffer import make_room
 from drivers.cameras.genicam.transport import DeviceIdentity, Payload
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraMisconfigured, CameraNotReached
 
@@ -26,7 +27,11 @@ _SUCCESS = 0
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _WANTED_BUFFER = 8 * 1024 * 1024
 _STATUS = {1: "is empty", 2: "lacks packets", 3: "lacks packets", 4: "has packets out of order", 5: "does not fit its buffer", 7: "was aborted"}
-LOST_CAMERA_THREAD = "aravis-lost-camera"
+_ROOM = 2
+"""Of the payload: the kernel counts a packet of 1400 bytes as 2304."""
+_COUNTERS = (b"n_received_packets", b"n_ignored_packets")
+_NO_PACKET_SOCKET = 1
+"""ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED."""
 _REMEDY = "Check cable, power and address; see that the camera answers `ping`."
 
 
@@ -59,6 +64,9 @@ class AravisTransport:
             if not library.call("arv_gv_device_is_controller", self._device):
                 self._lost = True  # whoever has no control cannot give it back
                 raise self._busy()
+            # For root Aravis would read a packet socket, which takes whatever passes on the computer until its filter is set;
+            # the first of these packets then decides which frame numbers count as late, and all of ours may be thrown away.
+            library.call("arv_gv_device_set_stream_options", self._device, _NO_PACKET_SOCKET)
             self._camera = self._ask("arv_camera_new_with_device", self._device)
             self._set_packets()
             names = ("DeviceVendorName", "DeviceModelName", "DeviceFirmwareVersion")
@@ -101,6 +109,7 @@ class AravisTransport:
         """A new stream at a new port, its buffers, and the camera sends."""
         size = self._ask("arv_camera_get_payload", self._camera)
         self._stream = self._ask("arv_device_create_stream", self._device, None, None)
+        make_room(self._call("arv_gv_stream_get_port", self._stream), _ROOM * size)
         for _ in range(_N_BUFFERS):
             self._call("arv_stream_push_buffer", self._stream, self._call("arv_buffer_new_allocate", size))
         self._ask("arv_camera_start_acquisition", self._camera)
@@ -127,7 +136,7 @@ class AravisTransport:
                     library.call("g_object_unref", handle)
 
         if self._lost:
-            threading.Thread(target=let_go, name=LOST_CAMERA_THREAD, daemon=True).start()
+            threading.Thread(target=let_go, name="aravis-lost-camera", daemon=True).start()
         else:
             let_go()
 
@@ -159,8 +168,11 @@ class AravisTransport:
         completed, failures, underruns = c_uint64(), c_uint64(), c_uint64()
         self._call("arv_gv_stream_get_statistics", self._stream, byref(resent), byref(missing))
         self._call("arv_stream_get_statistics", self._stream, byref(completed), byref(failures), byref(underruns))
+        received, ignored = (self._call("arv_stream_get_info_uint64_by_name", self._stream, name) for name in _COUNTERS)
         return {
             "packet_size": int(self._ask("arv_gv_device_get_packet_size", self._device)),
+            "packets_received": received,
+            "packets_ignored": ignored,
             "packets_resent": resent.value,
             "packets_missing": missing.value,
             "frames_failed": failures.value,

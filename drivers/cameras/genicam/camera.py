@@ -187,7 +187,10 @@ class GenicamCamera:
         return f" ({counts})" if counts else ""
 
     def _too_late(self, timeout_s: float) -> CameraTimeout:
+        counts = self._transport.statistics()
         remedy = "Allow more time; check trigger, exposure and, for GigE Vision, firewall and packet size."
+        if counts.get("packets_ignored"):
+            remedy = "Packets came that belong to no frame: let no other program use the camera or this port, and try again."
         return CameraTimeout(f"no frame came within {timeout_s:g} s of the {self._settings.trigger} trigger{self._counted()}", remedy=remedy)
 
     def _check_payload(self, payload: Payload) -> None:

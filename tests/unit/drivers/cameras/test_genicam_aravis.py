@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import struct
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +17,7 @@ import pytest
 from drivers.cameras.genicam import aravis, aravis_library, make_camera
 from drivers.cameras.genicam.aravis import AravisTransport, local_address, network_notes
 from drivers.cameras.genicam.camera import GenicamCamera
+from drivers.cameras.genicam.receive_buffer import make_room
 from drivers.contract.camera import CameraContract, CameraRig
 from drivers.contract.camera_rig import opened_camera
 from drivers.errors import CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, SettingsError
@@ -99,6 +105,47 @@ def test_points_come_bit_for_bit(bench: Bench) -> None:
         frame = camera.capture(timeout_s=3)
     assert np.array_equal(frame.xyz_mm, sent, equal_nan=True)
     assert frame.diagnostics["packets_missing"] == 0
+
+
+@contextmanager
+def passing_by(datagram: bytes) -> Iterator[None]:
+    """Other programs of this computer talk to each other meanwhile."""
+    ended = threading.Event()
+
+    def talk() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+            listener.bind(("127.0.0.9", 0))
+            while not ended.wait(0.0005):
+                speaker.sendto(datagram, listener.getsockname())
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_what_passes_by_on_the_network_is_no_matter(bench: Bench) -> None:
+    """For root Aravis reads a packet socket, whose filter is set late: what is in it by then looks like a frame with the number 65450."""
+    frame_id = struct.pack(">HHI", 0, 65450, 0)
+    with passing_by(frame_id.ljust(64, b"\0")), opened_camera(bench.rig()) as camera:
+        frame = camera.capture(timeout_s=3)
+    assert frame.diagnostics["packets_ignored"] == frame.diagnostics["frames_dropped"] == 0
+    assert frame.diagnostics["packets_received"] == -(-frame.xyz_mm.nbytes // 1364) + 2  # leader, data, trailer
+
+
+def test_a_socket_is_given_room_for_a_frame_and_no_descriptor_stays_behind() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as channel:
+        channel.bind(("127.0.0.1", 0))
+        before, descriptors = channel.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF), os.listdir("/dev/fd")
+        allowed = min(300_000, int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii")))
+        now = make_room(channel.getsockname()[1], 300_000)
+        assert now == channel.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= max(before, allowed)
+        assert make_room(channel.getsockname()[1], 10_000) == now
+        assert make_room(1, 10_000) is None
+        assert os.listdir("/dev/fd") == descriptors
 
 
 @pytest.mark.parametrize(
