@@ -27,6 +27,7 @@ from drivers.simulated.truth import Truth, mesh_path
 
 _STREAM_STOP, _STREAM_ENCODER, _STREAM_FRAME = 1, 2, 3
 _STILL_RAD = 1e-12
+_NAME_A_MESH = "Name a mesh file in mm, `stepped_block` or `machined_part`."
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,9 +238,12 @@ def _home(truth: Truth, model: RobotModel) -> FloatArray:
 
 def _mesh_data(truth: Truth, folder: Path) -> tuple[FloatArray, NDArray[np.int32]]:
     from drivers.simulated.workpiece import stepped_block
+    from drivers.simulated.workpiece_machined import MachinedPart
 
     if truth.workpiece is None or truth.workpiece.mesh == "stepped_block":
         return stepped_block()
+    if truth.workpiece.mesh == "machined_part":
+        return MachinedPart().mesh()
     import trimesh
 
     path = mesh_path(truth.workpiece, folder)
@@ -247,7 +251,7 @@ def _mesh_data(truth: Truth, folder: Path) -> tuple[FloatArray, NDArray[np.int32
         mesh = trimesh.load_mesh(path)
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32)
     except (OSError, ValueError, AttributeError, NotImplementedError) as error:
-        raise FileError(f"cannot be read as a mesh ({error})", file=path, remedy="Name a mesh file in mm, or `stepped_block`.") from error
+        raise FileError(f"cannot be read as a mesh ({error})", file=path, remedy=_NAME_A_MESH) from error
     if len(faces) == 0:
-        raise FileError("holds no mesh", file=path, remedy="Name a mesh file in mm, or `stepped_block`.")
+        raise FileError("holds no mesh", file=path, remedy=_NAME_A_MESH)
     return vertices, faces

@@ -198,7 +198,7 @@ class BoxTruth:
 
 @dataclass(frozen=True, slots=True)
 class WorkpieceTruth:
-    """A mesh in the cell: the built-in `stepped_block`, or a mesh file (mm) beside the truth file."""
+    """A mesh in the cell: the built-in `stepped_block` or `machined_part`, or a mesh file (mm) beside the truth file."""
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     base_from_part: Transform

@@ -30,48 +30,51 @@ def stepped_block(segments: int = 96) -> tuple[FloatArray, Faces]:
         _bored_block((x - 30, y - 50, 0), (x + 30, y + 50, 40), radius, segments)
         for (x, y), radius in zip(BORE_CENTRES_IN_PART_MM, BORE_RADII_MM, strict=True)
     ]
-    return _joined([*bored, _block((40, -50, 0), (80, 50, 60)), _cylinder((60, 0, 60), 15.0, 15.0, segments)])
+    return joined([*bored, block((40, -50, 0), (80, 50, 60)), cylinder((60, 0, 60), 15.0, 15.0, segments)])
 
 
-def _joined(solids: list[tuple[FloatArray, Faces]]) -> tuple[FloatArray, Faces]:
+def joined(solids: list[tuple[FloatArray, Faces]]) -> tuple[FloatArray, Faces]:
+    """Solids as one mesh, side by side."""
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in solids)])
     faces = [faces + offset for (_, faces), offset in zip(solids, offsets, strict=False)]
     return np.concatenate([vertices for vertices, _ in solids]), np.concatenate(faces).astype(np.int32)
 
 
-def _block(low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[FloatArray, Faces]:
+def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[FloatArray, Faces]:
+    """A box between two corners."""
     outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]], dtype=np.float64)
     return _prism(outline, low[2], high[2])
 
 
-def _cylinder(foot: tuple[float, float, float], radius: float, height: float, segments: int) -> tuple[FloatArray, Faces]:
-    return _prism(_circle(segments) * radius + foot[:2], foot[2], foot[2] + height)
+def cylinder(foot: tuple[float, float, float], radius: float, height: float, segments: int) -> tuple[FloatArray, Faces]:
+    """A round post on a foot (x, y, z)."""
+    return _prism(circle(segments) * radius + foot[:2], foot[2], foot[2] + height)
 
 
 def _prism(outline: FloatArray, bottom: float, top: float) -> tuple[FloatArray, Faces]:
     """A convex outline (n, 2), counter-clockwise, between two heights."""
     n = len(outline)
-    vertices = np.concatenate([_at_height(outline, bottom), _at_height(outline, top)])
+    vertices = np.concatenate([at_height(outline, bottom), at_height(outline, top)])
     fan = np.array([[0, i, i + 1] for i in range(1, n - 1)])
-    return vertices, np.concatenate([fan[:, ::-1], fan + n, _strip(n, 0, n)]).astype(np.int32)
+    return vertices, np.concatenate([fan[:, ::-1], fan + n, strip(n, 0, n)]).astype(np.int32)
 
 
 def _bored_block(low: tuple[float, float, float], high: tuple[float, float, float], radius: float, segments: int) -> tuple[FloatArray, Faces]:
     """A block with a round bore through the middle along z."""
-    circle = _circle(segments)
+    unit = circle(segments)
     centre = (np.array(low[:2]) + high[:2]) / 2
     half = (np.array(high[:2]) - low[:2]) / 2
     # the circle pushed out to the unit square: multiples of 45 degrees become its corners
-    outer = circle / np.abs(circle).max(axis=1, keepdims=True) * half + centre
-    inner = circle * radius + centre
-    layers = [_at_height(outer, low[2]), _at_height(outer, high[2]), _at_height(inner, high[2]), _at_height(inner, low[2])]
+    outer = unit / np.abs(unit).max(axis=1, keepdims=True) * half + centre
+    inner = unit * radius + centre
+    layers = [at_height(outer, low[2]), at_height(outer, high[2]), at_height(inner, high[2]), at_height(inner, low[2])]
     n = segments
     # one closed band around: outside, top, bore, bottom
-    bands = [_strip(n, k * n, ((k + 1) % 4) * n) for k in range(4)]
+    bands = [strip(n, k * n, ((k + 1) % 4) * n) for k in range(4)]
     return np.concatenate(layers), np.concatenate(bands).astype(np.int32)
 
 
-def _strip(n: int, lower: int, upper: int) -> NDArray[np.int64]:
+def strip(n: int, lower: int, upper: int) -> NDArray[np.int64]:
     """Triangles between two rings of n vertices that start at the given indices, outward for upper above lower."""
     i = np.arange(n)
     j = (i + 1) % n
@@ -80,10 +83,12 @@ def _strip(n: int, lower: int, upper: int) -> NDArray[np.int64]:
     )
 
 
-def _circle(segments: int) -> FloatArray:
+def circle(segments: int) -> FloatArray:
+    """(n, 2) corners of a regular polygon in the unit circle."""
     angle = np.arange(segments) * (2 * np.pi / segments)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _at_height(outline: FloatArray, z: float) -> FloatArray:
+def at_height(outline: FloatArray, z: float) -> FloatArray:
+    """(n, 3) an outline (n, 2) at one z."""
     return np.column_stack([outline, np.full(len(outline), z)])

@@ -13,6 +13,7 @@ from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.draws import transform_rows
 from drivers.simulated.truth import Truth, WorkpieceTruth
 from drivers.simulated.workpiece import BLOCK_SIZE_MM, BORE_RADII_MM, stepped_block
+from drivers.simulated.workpiece_machined import MachinedPart
 from tests.support.simulated import paper_model
 
 
@@ -28,6 +29,22 @@ def test_volume_is_that_of_the_drawing() -> None:
     bores = sum(np.pi * radius**2 * 40 for radius in BORE_RADII_MM)
     expected = 120 * 100 * 40 - bores + 40 * 100 * 60 + np.pi * 15**2 * 15
     assert trimesh.Trimesh(vertices, faces, process=False).volume == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_machined_part_is_closed_solids_of_the_volumes_of_its_drawing() -> None:
+    vertices, faces = MachinedPart().mesh(segments=720)
+    solids = trimesh.Trimesh(vertices, faces, process=False).split(only_watertight=True)
+    assert all(solid.is_winding_consistent for solid in solids)
+    sink = np.pi * 5 / 3 * (15**2 + 15 * 10 + 10**2)
+    expected = [45 * 100 * 40 - np.pi * 10**2 * 35 - sink, 45 * 100 * 40 - np.pi * 15**2 * 40, 35 * 100 * 40 - (np.pi * 6**2 + 28 * 12) * 40]
+    expected += [35 * 100 * 58, np.pi * 11**2 * 12]
+    assert [solid.volume for solid in solids] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_machined_part_can_be_simulated_by_name() -> None:
+    mesh = SimulatedCell(Truth(workpiece=WorkpieceTruth(transform_rows(np.eye(4)), mesh="machined_part")), paper_model()).mesh()
+    assert mesh is not None
+    np.testing.assert_allclose(np.ptp(mesh.vertices_in_part_mm, axis=0), [160, 100, 70])
 
 
 def test_size_and_origin() -> None:
