@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibrate.assemble import without_pose_noise
 from calibrate.camera_error import CameraError, FreeCrossing, FullPillowError, PillowError, PolynomialError
 from calibrate.camera_error_field import field_variants, lateral_variants, richest_field
 from calibrate.camera_error_stack import StackedModels
-from calibrate.clouds import Solution
+from calibrate.clouds import Solution, solve_clouds
 from calibrate.crossing import find_crossing
 from calibrate.linear_folds import Folds, full_step, held_out_miss_mm, linear_folds, noise_of
 from calibrate.normal import NoiseModel
 from calibrate.problem import Problem, State
-from calibrate.validation import N_FOLDS, folds_of
+from calibrate.validation import N_FOLDS, cross_validate, folds_of, squared_errors_mm2
 from drivers.kinematics.se3 import FloatArray
 
 _TYPICAL_CAP = 16.0
@@ -51,22 +52,35 @@ class Choice:
 
 def is_open(models: Sequence[CameraError], problem: Problem) -> bool:
     """Whether the data have a say in the model: several to compare, a smoothness or a sight crossing to be found."""
-    return problem.along_sight and (len(models) > 1 or len(variants_of(models[0])) > 1 or isinstance(models[0], FreeCrossing))
+    if not problem.along_sight:
+        return len(models) > 1
+    return len(models) > 1 or len(variants_of(models[0])) > 1 or isinstance(models[0], FreeCrossing)
 
 
 def choose_model(solution: Solution, models: Sequence[CameraError]) -> Choice:
     """Compare models, the simplest first, on left-out shots, or find the sight crossing of the only one.
 
     Args:
-        solution: with the last of the models, good enough on points that may be thinned.
+        solution: with the last of the models, good enough on points that may be thinned; of profiles with all of theirs.
         models: several of which the last is a field, or one field, or one pillow with a free crossing.
     """
     if isinstance(models[-1], FreeCrossing):
         found, state = find_crossing(solution)
         return Choice(found, state, {})
-    tried = try_families(solution, [variants_of(model) for model in models])
+    if solution.problem.along_sight:
+        tried = try_families(solution, [variants_of(model) for model in models])
+    else:
+        tried = [_solved_with(solution, model) for model in models]
     chosen = tried[simplest_of_the_best([one.squared_errors_mm2 for one in tried])]
     return Choice(chosen.model, chosen.state, {one.model.name: one.rms_mm for one in tried} if len(tried) > 1 else {})
+
+
+def _solved_with(solution: Solution, model: CameraError) -> Tried:
+    """A model solved for by itself: profiles have too few points for that to take long, and no centre for folds without solves."""
+    problem = replace(solution.problem, camera_error=model)
+    start = replace(without_pose_noise(solution.state, problem.n_scans), camera_mm=np.zeros(len(model.prior_sigma_mm)))
+    found = solve_clouds(problem, start, solution.noise)
+    return Tried(model, found.state, squared_errors_mm2(cross_validate(found)))
 
 
 def try_families(solution: Solution, families: Sequence[Sequence[CameraError]]) -> list[Tried]:

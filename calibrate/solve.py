@@ -48,6 +48,8 @@ from drivers.kinematics.se3 import FloatArray
 _LOG = logging.getLogger(__name__)
 _DEFAULT_SIGHT_CROSSING_MM = (60.0, 0.0, 500.0)
 _AUTO = ("none", "affine", "pillow", "field")
+_LEAST_PROFILES = 30
+"""Fewer do not tell an error of the camera from the arm's."""
 _THIN_POINTS = 250
 _REJECT_ROUNDS = 4
 _FIRST_NOISE = NoiseModel(point_mm=0.05, pose_mm=0.3, pose_rad=5e-4)
@@ -250,7 +252,7 @@ def _solved_by_method(
 
 
 def _candidates(observations: Observations, cell: Cell, settings: CalibrationSettings) -> list[CameraError]:
-    if cell.camera.kind == "line_profile" and settings.camera_error == "auto":
+    if cell.camera.kind == "line_profile" and settings.camera_error == "auto" and len(observations.shots) < _LEAST_PROFILES:
         return [NoCameraError()]
     names = _AUTO if settings.camera_error == "auto" else (settings.camera_error,)
     points = np.concatenate([shot.points_in_camera_mm for shot in observations.shots])

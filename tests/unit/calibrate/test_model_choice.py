@@ -18,13 +18,16 @@ from calibrate.linear_folds import Folds, full_step, held_out_miss_mm, linear_fo
 from calibrate.model_choice import choose_model, is_open, simplest_of_the_best
 from calibrate.problem import Problem
 from calibrate.solve import CalibrationSettings, calibrate
+from calibrate.start_arcs import start_from_arcs
 from calibrate.validation import cross_validate, folds_of
 from drivers.files.session import read_session
+from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from tests.support.bound import FIRST_NOISE, held_out_rms_mm
 from tests.support.solving import draw_shots, noise_free, problem_of, start_of
 from tests.support.synthetic import bowl_ripple_mm, paper_cell, pillow_error_mm
 from tests.support.synthetic_session import write_session
+from tests.unit.calibrate.test_start import arcs
 
 CELL = paper_cell()
 N_SHOTS, N_POINTS = 60, 120
@@ -114,6 +117,26 @@ def test_the_model_that_the_camera_needs_is_chosen(error: str, allowed: set[str]
     assert choice.model.name in allowed
     assert list(choice.held_out_rms_mm) == ["none", "affine", "pillow", "field"]
     assert len(choice.state.camera_mm) == len(choice.model.axis)
+
+
+@pytest.mark.parametrize(("error", "allowed"), [("none", {"none"}), ("pillow", {"pillow", "field"})])
+def test_profiles_choose_by_solves_of_each_model(error: str, allowed: set[str]) -> None:
+    """Arcs that a camera with three times the paper's error saw; the plane of a profile shows it in depth."""
+    problem, cell = arcs(40, noise_mm=0.03, seed=41)
+    points = problem.points_in_camera_mm.copy()
+    points[:, 2] -= 3.0 * ERRORS[error](points)
+    noise = se3.exp(np.random.default_rng(42).normal(size=(40, 6)) * ([0.05] * 3 + [1e-4] * 3))
+    problem = replace(problem, points_in_camera_mm=points, base_from_flange=problem.base_from_flange @ noise)
+    models = [NoCameraError(), affine_error(box_of_points(points)), PillowError(), default_field(box_of_points(points))]
+    problem = with_model(problem, models[-1])
+    assert is_open(models, problem)
+    assert not is_open(models[:1], problem)
+    choice = choose_model(solve_clouds(problem, start_from_arcs(problem, cell.flange_from_camera).state, FIRST_NOISE), models)
+    assert choice.model.name in allowed
+    assert len(choice.state.camera_mm) == len(choice.model.axis)
+    held = choice.held_out_rms_mm
+    assert list(held) == ["none", "affine", "pillow", "field"]
+    assert error == "none" or held[choice.model.name] < 0.9 * held["none"]
 
 
 def test_left_out_shots_choose_a_stiffer_field_where_there_is_less_to_follow(solutions: dict[str, Solution]) -> None:
