@@ -127,7 +127,7 @@ def test_profiles_choose_by_solves_of_each_model(error: str, allowed: set[str]) 
     points[:, 2] -= 3.0 * ERRORS[error](points)
     noise = se3.exp(np.random.default_rng(42).normal(size=(40, 6)) * ([0.05] * 3 + [1e-4] * 3))
     problem = replace(problem, points_in_camera_mm=points, base_from_flange=problem.base_from_flange @ noise)
-    models = [NoCameraError(), affine_error(box_of_points(points)), PillowError(), default_field(box_of_points(points))]
+    models: list[CameraError] = [NoCameraError(), affine_error(box_of_points(points)), PillowError(), default_field(box_of_points(points))]
     problem = with_model(problem, models[-1])
     assert is_open(models, problem)
     assert not is_open(models[:1], problem)
