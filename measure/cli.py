@@ -14,11 +14,14 @@ from typing import Annotated
 import typer
 
 from measure.cli_abb import abb_program
+from measure.cli_camera_check import camera_check
 from measure.cli_capture import capture
 from measure.cli_cell import doctor, new_cell
+from measure.cli_check import check
 from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
 from measure.cli_export import export
+from measure.cli_history import activate, diff, history, rollback
 from measure.cli_import import import_session
 from measure.cli_jobs import jobs
 from measure.cli_measure import stitch, verify
@@ -54,8 +57,14 @@ VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("teach", teach, "Lead the arm by hand, or jog it, and keep poses."),
     ("import", import_session, "Make a session from others' poses and clouds."),
     ("centres", centres, "Find the sphere's centre in every shot."),
+    ("camera-check", camera_check, "See a sphere over the camera's volume, uncalibrated."),
     ("calibrate", calibrate, "Calibrate robot, hand-eye and camera together."),
     ("verify", verify, "Prove a calibration on shots that it never saw."),
+    ("check", check, "Tell from a few shots whether something changed, and what."),
+    ("history", history, "List a cell's calibrations, checks and verifications."),
+    ("activate", activate, "Put a calibration to use in its cell."),
+    ("rollback", rollback, "Go back to the calibration that was used before."),
+    ("diff", diff, "Compare two calibrations over the work volume."),
     ("stitch", stitch, "Put a session's scans into one cloud in the base."),
     ("report", report, "Write report.html: the calibration and its proof."),
     ("show", show, "Write a Rerun recording of sessions, before and after."),

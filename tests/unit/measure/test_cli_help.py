@@ -28,7 +28,7 @@ sys.exit(code)
 
 VERBS = [
     *("demo", "new", "doctor", "plan", "predict", "capture", "centres", "calibrate", "verify", "stitch", "report", "show", "study"),
-    *("simulate-controller", "abb-program", "serve-cell"),
+    *("simulate-controller", "abb-program", "serve-cell", "camera-check"),
 ]
 
 
