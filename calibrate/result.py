@@ -32,6 +32,8 @@ from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
 _CHUNK = 50_000
+_COMPILED_FROM = 20_000
+"""Points from which the compiled kernel is worth loading."""
 _MEAN_SQUARE_COSINE = 7.0 / 12.0
 """Of the incidence over a cap of 60 degrees: turns noise along the normal into noise along the sight."""
 
@@ -177,7 +179,7 @@ class Calibration:
     def points_in_base_mm(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
     ) -> FloatArray:
-        """Measured points (n, 3) in the base.
+        """Measured points (n, 3) in the base; whole scans at one pose go through a compiled kernel, equal to 1e-9 mm.
 
         Args:
             points_in_camera_mm: (n, 3) as the camera gave them; NaN rows stay NaN.
@@ -187,12 +189,21 @@ class Calibration:
         Raises:
             SettingsError: not exactly the one of the two that fits this calibration, or a wrong shape.
         """
-        corrected = self.corrected_points_in_camera_mm(points_in_camera_mm)
-        flange = self._flange(joints_rad, base_from_flange, len(corrected))
-        base_from_camera = flange @ self.flange_from_camera
+        measured = _points(points_in_camera_mm)
+        base_from_camera = self._flange(joints_rad, base_from_flange, len(measured)) @ self.flange_from_camera
+        if base_from_camera.ndim == 2 and len(measured) >= _COMPILED_FROM:
+            return self._placed(measured, base_from_camera)
+        corrected = measured + self.camera_correction_mm(measured)
         if base_from_camera.ndim == 2:
             return np.asarray(corrected @ base_from_camera[:3, :3].T + base_from_camera[:3, 3])
         return se3.apply(base_from_camera, corrected)
+
+    def _placed(self, points_in_camera_mm: FloatArray, base_from_camera: FloatArray) -> FloatArray:
+        from calibrate.placing_kernels import place_points
+
+        result = np.empty_like(points_in_camera_mm)
+        place_points(points_in_camera_mm, self.camera_error.polynomials, self.camera_mm, base_from_camera, result)
+        return result
 
     def point_covariance_in_base_mm2(
         self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None

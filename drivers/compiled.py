@@ -26,8 +26,8 @@ _VECTOR_FLAGS = {"reassoc", "contract", "arcp", "nsz"}
 
 
 def compiled(function: Function) -> Function:
-    """Compile one kernel for one thread, cached on disk where the folder is writable."""
-    return cast(Function, numba.njit(cache=True)(function))
+    """Compile one kernel for one thread, cached on disk where the folder is writable; other threads run beside it."""
+    return cast(Function, numba.njit(cache=True, nogil=True)(function))
 
 
 def compiled_parallel(function: Function) -> Function:
@@ -37,7 +37,7 @@ def compiled_parallel(function: Function) -> Function:
 
 def vectorised(function: Function) -> Function:
     """As `compiled`, its loops free to use vector instructions."""
-    return cast(Function, numba.njit(cache=True, error_model="numpy", fastmath=_VECTOR_FLAGS)(function))
+    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_VECTOR_FLAGS)(function))
 
 
 def vectorised_parallel(function: Function) -> Function:

@@ -2,26 +2,63 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.errors import DataError
-from drivers.files.ply import PointCloud, write_ply
+from drivers.errors import DataError, SettingsError
+from drivers.files.ply import PointCloud
 from drivers.files.session import Session, Shot, read_scan
-from measure.fuse import FusedCloud, VoxelGrid, flying_pixel_mask
-from measure.placing import MeasuringSystem, check_fits, points_of_shot_in_base_mm
+from measure.fuse import DEFAULT_MEMORY_MB, FusedCloud, VoxelGrid
+from measure.placing import check_fits
+from measure.stitching.outputs import CloudLabel, check_suffix, read_fused, write_cloud
+from measure.stitching.scan import DEFAULT_CLEANING, NO_CLEANING, Cleaning, StitchingSystem, prepare_scan, unit_variance_mm2
 
 Progress = Callable[[int, int], None]
 """Called after each scan with the number done and the number of all."""
 
-_SMALLEST_SCAN_MM = 20.0
-_PIECE = 1 << 15
+
+@dataclass(frozen=True, slots=True)
+class StitchSettings:
+    """How to stitch."""
+
+    voxel_mm: float = 0.5
+    cleaning: Cleaning = DEFAULT_CLEANING
+    min_count: int = 1
+    """Voxels with fewer points are left out."""
+    full: bool = True
+    """Normals, spread and uncertainty too; otherwise means, counts and weights."""
+    memory_mb: float = DEFAULT_MEMORY_MB
+    """Budget of the voxel table; beyond it the table goes to disk, beside the output."""
+    n_threads: int | None = None
+    """Scans worked on at a time; as many as there are processors if None. It changes no bit of the result."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanCounts:
+    """What became of the points of some scans."""
+
+    n_valid: int = 0
+    n_edge: int = 0
+    n_grazing: int = 0
+    n_speck: int = 0
+    n_outside: int = 0
+    empty_shots: tuple[int, ...] = ()
+    """Indices of shots without a valid point."""
+
+    def __add__(self, other: ScanCounts) -> ScanCounts:
+        """Of both."""
+        return ScanCounts(
+            self.n_valid + other.n_valid,
+            self.n_edge + other.n_edge,
+            self.n_grazing + other.n_grazing,
+            self.n_speck + other.n_speck,
+            self.n_outside + other.n_outside,
+            self.empty_shots + other.empty_shots,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,24 +67,37 @@ class StitchResult:
 
     out: Path
     n_scans: int
-    n_points_in: int
-    """Valid points read."""
+    counts: ScanCounts
     n_points: int
     """Points written, one per voxel."""
-    n_edge_points: int
-    """Valid points dropped as flying pixels."""
-    n_outside: int
-    """Valid points dropped because no robot reaches that far."""
+    n_tiles: int
+    """How often the voxel table went to disk."""
     voxel_mm: float
     calibration_id: str
     session_digest: str
     seconds: float
-    cloud: FusedCloud
+    marks: tuple[str, ...] = ()
+    """How robot and camera differ from those that were calibrated, where the cell file lets that pass."""
+
+    @property
+    def n_points_in(self) -> int:
+        """Valid points read."""
+        return self.counts.n_valid
+
+    @property
+    def n_edge_points(self) -> int:
+        """Valid points dropped as flying pixels."""
+        return self.counts.n_edge
 
     @property
     def points_per_second(self) -> float:
         """Valid points read per second, all steps included."""
         return self.n_points_in / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def cloud(self) -> FusedCloud:
+        """The cloud, read back from a PLY file; FileError where it has gone, or is of another format."""
+        return read_fused(self.out)
 
     def to_json_dict(self) -> dict[str, object]:
         """The object that `--json` prints."""
@@ -58,73 +108,106 @@ class StitchResult:
             "seconds": self.seconds,
             "points_per_second": self.points_per_second,
             "n_scans": self.n_scans,
-            "n_edge_points": self.n_edge_points,
-            "n_outside": self.n_outside,
+            "n_edge_points": self.counts.n_edge,
+            "n_grazing_points": self.counts.n_grazing,
+            "n_speck_points": self.counts.n_speck,
+            "n_outside": self.counts.n_outside,
+            "empty_shots": list(self.counts.empty_shots),
+            "n_tiles": self.n_tiles,
             "voxel_mm": self.voxel_mm,
             "calibration": self.calibration_id,
             "session": self.session_digest,
+            "marks": list(self.marks),
         }
 
 
+class Stitcher:
+    """Scans in, one cloud out: for those who have the scans before the session is closed, such as an in-line measurement."""
+
+    def __init__(self, calibration: StitchingSystem, session: Session, settings: StitchSettings, *, spill_folder: Path | None = None) -> None:
+        """An empty cloud; SettingsError for a voxel size or budget that is no positive number."""
+        self._calibration = calibration
+        self._session = session
+        self._cleaning = settings.cleaning
+        unit = unit_variance_mm2(calibration.noise)
+        self.grid = VoxelGrid(
+            settings.voxel_mm, full=settings.full, unit_variance_mm2=unit, memory_mb=settings.memory_mb, spill_folder=spill_folder
+        )
+
+    def add(self, shot: Shot, cloud: PointCloud) -> ScanCounts:
+        """Fuse one scan; from any thread, in any order.
+
+        Raises:
+            DataError: the shot lacks the pose that the calibration needs, its scan is in another unit, or a voxel is overfull.
+        """
+        scan = prepare_scan(self._calibration, self._session, shot, cloud, self._cleaning)
+        full = self.grid.full
+        added = self.grid.add(
+            scan.points_in_base_mm, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None
+        )
+        empty = () if scan.n_valid else (shot.index,)
+        return ScanCounts(scan.n_valid, scan.n_edge, scan.n_grazing, scan.n_speck, added.n_outside, empty)
+
+
 def stitch(
-    calibration: MeasuringSystem,
+    calibration: StitchingSystem,
     session: Session,
     out: str | Path,
     voxel_mm: float = 0.5,
     *,
     clean_edges: bool = True,
     min_count: int = 1,
+    settings: StitchSettings | None = None,
     on_progress: Progress | None = None,
 ) -> StitchResult:
-    """Fuse every good scan of a session into one cloud in the base and write it as PLY.
+    """Fuse every good scan of a session into one cloud in the base and write it.
 
-    The file holds float x y z in mm, `count` (points of the voxel) and `spread` (their rms distance from the mean, mm)
-    per point; its comments name unit, frame, calibration and session. It appears whole or not at all. The result does
-    not depend on the order of the scans.
+    The file (PLY; PCD, E57 or LAZ by its ending) holds for each point the mean in mm, normal, count, weight, number of
+    scans, spread and standard uncertainty along the normal; it names unit, frame, calibration and session. It appears
+    whole or not at all. The result does not depend on the order of the scans nor on the number of threads.
 
     Args:
         calibration: what moves points from the camera to the base.
         session: with at least one good scan; each scan is used once, however many lines of shots.jsonl name it.
-        out: the PLY file.
+        out: the file.
         voxel_mm: edge of the voxels.
-        clean_edges: drop flying pixels of organised scans first (`flying_pixel_mask`).
+        clean_edges: drop flying pixels, grazing surfaces and specks of organised scans first.
         min_count: leave out voxels with fewer points.
+        settings: all of these and more; wins over the former three.
         on_progress: told after each scan.
 
     Raises:
         DataError: no good scan, a shot without the pose the calibration needs, no point left.
         FileError: a scan is missing, broken or changed; the folder of `out` is not writable.
-        SettingsError: a voxel size that is no positive number.
+        SettingsError: a voxel size that is no positive number, an ending that is not known or whose library is missing.
     """
     began = time.perf_counter()
-    grid = VoxelGrid(voxel_mm)
-    check_fits(calibration, session)
+    chosen = settings or StitchSettings(voxel_mm, DEFAULT_CLEANING if clean_edges else NO_CLEANING, min_count)
+    target = Path(out)
+    check_suffix(target)
+    stitcher = Stitcher(calibration, session, chosen, spill_folder=target.parent)
+    marks = check_fits(calibration, session)
     shots = scans_once(session)
-    n_valid = n_edge = n_outside = 0
-    for done, (shot, cloud) in enumerate(_read_ahead(session, shots), start=1):
-        valid = np.asarray(np.isfinite(cloud.xyz_mm).all(axis=-1))
-        _require_mm(cloud, valid, session, shot)
-        kept = _without_edges(cloud, valid) if clean_edges else valid
-        n_outside += _fuse(grid, calibration, session, shot, cloud.xyz_mm[kept])
-        n_valid += int(valid.sum())
-        n_edge += int(valid.sum() - kept.sum())
+    counts = ScanCounts()
+    for done, added in enumerate(_fused_scans(stitcher, session, shots, chosen.n_threads), start=1):
+        counts += added
         if on_progress is not None:
             on_progress(done, len(shots))
-    fused = grid.fused(min_count=min_count)
-    _require_points(fused, session, n_valid, n_edge)
-    _write(Path(out), fused, calibration, session, len(shots))
+    n_points = stitcher.grid.n_fused(min_count=chosen.min_count)
+    _require_points(n_points, session, counts)
+    label = cloud_label(calibration, session, chosen, len(shots))
+    write_cloud(target, stitcher.grid.pieces(min_count=chosen.min_count), n_points, label)
     return StitchResult(
-        out=Path(out),
+        out=target,
         n_scans=len(shots),
-        n_points_in=n_valid,
-        n_points=len(fused.points_mm),
-        n_edge_points=n_edge,
-        n_outside=n_outside,
-        voxel_mm=grid.voxel_mm,
+        counts=counts,
+        n_points=n_points,
+        n_tiles=stitcher.grid.n_tiles,
+        voxel_mm=stitcher.grid.voxel_mm,
         calibration_id=calibration.id,
         session_digest=session.digest,
         seconds=time.perf_counter() - began,
-        cloud=fused,
+        marks=marks,
     )
 
 
@@ -143,63 +226,57 @@ def scans_once(session: Session) -> tuple[Shot, ...]:
     return tuple(first_of_scan.values())
 
 
-def _read_ahead(session: Session, shots: Sequence[Shot]) -> Iterator[tuple[Shot, PointCloud]]:
-    """Scans in order, the next one being read and checked while this one is worked on."""
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read_scan") as reader:
-        coming = reader.submit(read_scan, session, shots[0])
-        for shot, following in zip(shots, [*shots[1:], None], strict=True):
-            cloud = coming.result()
-            if following is not None:
-                coming = reader.submit(read_scan, session, following)
-            yield shot, cloud
-
-
-def _fuse(grid: VoxelGrid, calibration: MeasuringSystem, session: Session, shot: Shot, points_in_camera_mm: NDArray[np.float32]) -> int:
-    """Move points (n, 3) to the base and add them; the number that fell outside the grid's range.
-
-    In pieces that stay in the processor's cache: a whole scan at once takes twice as long.
-    """
-    pieces = range(0, len(points_in_camera_mm), _PIECE)
-    clouds = (points_of_shot_in_base_mm(calibration, session, shot, points_in_camera_mm[i : i + _PIECE].astype(np.float64)) for i in pieces)
-    return sum(grid.add(cloud).n_outside for cloud in clouds)
-
-
-def _without_edges(cloud: PointCloud, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    # a scan without a grid has no neighbours to judge by
-    if cloud.xyz_mm.ndim != 3 or min(cloud.xyz_mm.shape[:2]) < 3:
-        return valid
-    return valid & flying_pixel_mask(cloud.xyz_mm)
-
-
-def _require_mm(cloud: PointCloud, valid: NDArray[np.bool_], session: Session, shot: Shot) -> None:
-    # a look at some points clears nearly every scan
-    if any(valid[part].any() and float(np.abs(cloud.xyz_mm[part][valid[part]]).max()) >= _SMALLEST_SCAN_MM for part in (np.s_[::97], np.s_[:])):
-        return
-    if valid.any():
-        raise DataError(
-            f"the whole scan of shot {shot.index} lies within {_SMALLEST_SCAN_MM:g} mm of the camera",
-            file=session.folder / str(shot.scan),
-            remedy="It is probably in metres: scans are in mm.",
-        )
-
-
-def _require_points(fused: FusedCloud, session: Session, n_valid: int, n_edge: int) -> None:
-    if len(fused.points_mm) == 0:
-        raise DataError(
-            f"no point is left of {n_valid} valid ones ({n_edge} dropped at depth edges)",
-            file=session.folder,
-            remedy="Look at the scans; switch the edge cleaning off; ask for fewer points a voxel.",
-        )
-
-
-def _write(out: Path, fused: FusedCloud, calibration: MeasuringSystem, session: Session, n_scans: int) -> None:
+def cloud_label(calibration: StitchingSystem, session: Session, settings: StitchSettings, n_scans: int) -> CloudLabel:
+    """What the file says of a cloud."""
     comments = (
         "unit mm",
         "frame base",
         f"calibration {calibration.id}",
         f"session {session.digest}",
-        f"voxel_mm {fused.voxel_mm:g}",
+        f"voxel_mm {settings.voxel_mm:g}",
         f"scans {n_scans}",
+        "uncertainty is standard (k = 1), mm, along the normal",
     )
-    properties = {"count": fused.count.astype(np.uint32), "spread": fused.spread_mm.astype(np.float32)}
-    write_ply(out, fused.points_mm.astype(np.float32), properties=properties, comments=comments)
+    return CloudLabel(comments, f"base frame, calibration {calibration.id[:12]}")
+
+
+def n_workers(n_threads: int | None) -> int:
+    """Threads to use: those asked for, or one a processor that this process may use.
+
+    Raises:
+        SettingsError: less than one.
+    """
+    if n_threads is not None and n_threads < 1:
+        raise SettingsError(f"{n_threads} threads", where="n_threads", remedy="Use one or more.")
+    return n_threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+
+
+def _fused_scans(stitcher: Stitcher, session: Session, shots: Sequence[Shot], n_threads: int | None) -> Iterator[ScanCounts]:
+    """What became of each scan, in order; at most two a thread are in hand, so that memory does not grow with the scans."""
+    n = n_workers(n_threads)
+
+    def work(shot: Shot) -> ScanCounts:
+        return stitcher.add(shot, read_scan(session, shot))
+
+    with ThreadPoolExecutor(max_workers=n, thread_name_prefix="stitch") as pool:
+        waiting: list[Future[ScanCounts]] = []
+        try:
+            for shot in shots:
+                waiting.append(pool.submit(work, shot))
+                if len(waiting) >= 2 * n:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _require_points(n_points: int, session: Session, counts: ScanCounts) -> None:
+    if n_points == 0:
+        dropped = f"{counts.n_edge} at depth edges, {counts.n_grazing} seen too grazing, {counts.n_speck} in specks, {counts.n_outside} out of reach"
+        raise DataError(
+            f"no point is left of {counts.n_valid} valid ones ({dropped})",
+            file=session.folder,
+            remedy="Look at the scans; switch the cleaning off; ask for fewer points a voxel.",
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -70,6 +71,11 @@ def write_atomic(path: str | Path, *chunks: bytes | memoryview) -> None:
     Raises:
         FileError: when the folder is missing or not writable, or the disk is full.
     """
+    write_atomic_pieces(path, chunks)
+
+
+def write_atomic_pieces(path: str | Path, chunks: Iterable[bytes | memoryview]) -> None:
+    """`write_atomic` for pieces that are made one after the other; where making one fails, so does the write."""
     target = Path(path)
     try:
         descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)

@@ -123,7 +123,7 @@ def encode_ply(xyz_mm: ArrayLike, *, properties: Mapping[str, ArrayLike] | None 
         records[axis] = points[:, i]
     for name, values in columns.items():
         records[name] = values
-    return _header_text(records.dtype, xyz.shape[:-1], comments).encode() + records.tobytes()
+    return ply_header(records.dtype, xyz.shape[:-1], comments).encode() + records.tobytes()
 
 
 def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> AnyArray:
@@ -135,7 +135,8 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> AnyArray:
     return array.astype(array.dtype.newbyteorder("<"), copy=False).reshape(-1)
 
 
-def _header_text(dtype: np.dtype[np.void], shape: tuple[int, ...], comments: Sequence[str]) -> str:
+def ply_header(dtype: np.dtype[np.void], shape: tuple[int, ...], comments: Sequence[str]) -> str:
+    """Header of records (n,) or of a grid (height, width), little-endian scalars x y z first."""
     kept = [text for text in (" ".join(comment.split()) for comment in comments) if not re.fullmatch(r"(width|height) \d+", text)]
     grid = [f"width {shape[1]}", f"height {shape[0]}"] if len(shape) == 2 else []
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in kept + grid)]

@@ -47,6 +47,7 @@ class TrueSystem:
     cell: SyntheticCell
     pose_only: bool = False
     id: str = "0" * 64
+    identity: Mapping[str, object] = field(default_factory=dict)
     radius_offset_mm: float = 0.0
     limits: Limits | None = None
     shots: tuple[TrainedOn, ...] = ()
@@ -70,6 +71,13 @@ class TrueSystem:
         points[:, 2] -= self.cell.camera_error_mm(points)
         flange = mdh.base_from_flange(self.cell.true, joints_rad) if joints_rad is not None else np.asarray(base_from_flange)
         return se3.apply(flange @ self.cell.flange_from_camera, points)
+
+    @property
+    def flange_from_camera(self) -> FloatArray:
+        return self.cell.flange_from_camera
+
+    def base_from_flange(self, joints_rad: ArrayLike) -> FloatArray:
+        return mdh.base_from_flange(self.cell.true, joints_rad)
 
     @property
     def covariance(self) -> FloatArray:

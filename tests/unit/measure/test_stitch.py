@@ -14,7 +14,8 @@ from drivers.errors import DataError, FileError, SettingsError
 from drivers.files.ply import read_ply
 from drivers.files.session import Session, read_session
 from measure.fuse import VoxelGrid
-from measure.stitch import scans_once, stitch
+from measure.stitch import StitchSettings, scans_once, stitch
+from measure.stitching.scan import NO_CLEANING, prepare_scan, unit_variance_mm2
 from tests.support.recorded import PLACES, TrueSystem, record_session, write_cell
 from tests.support.synthetic import paper_cell
 
@@ -44,27 +45,42 @@ def test_the_stitched_points_lie_on_the_spheres(session: Session, tmp_path: Path
     json.dumps(result.to_json_dict())
 
 
+def fused_by_hand(system: TrueSystem, session: Session, voxel_mm: float) -> VoxelGrid:
+    grid = VoxelGrid(voxel_mm, unit_variance_mm2=unit_variance_mm2(system.noise))
+    for shot in session.shots[::-1]:
+        scan = prepare_scan(system, session, shot, read_ply(session.folder / str(shot.scan)), NO_CLEANING)
+        grid.add(scan.points_in_base_mm, weights=scan.weights, normals=scan.normals, variances=scan.variances)
+    return grid
+
+
 def test_the_file_holds_the_fused_points_of_all_scans(session: Session, tmp_path: Path) -> None:
     """Against fusing by hand in another order."""
     result = stitch(SYSTEM, session, tmp_path / "cloud.ply", 2.0)
-    grid = VoxelGrid(2.0)
-    for shot in session.shots[::-1]:
-        points = read_ply(session.folder / str(shot.scan)).points_mm
-        grid.add(SYSTEM.points_in_base_mm(points, joints_rad=shot.joints_rad))
-    by_hand = grid.fused()
-    assert result.cloud.points_mm.tobytes() == by_hand.points_mm.tobytes()
-    assert result.cloud.count.tobytes() == by_hand.count.tobytes()
+    by_hand, cloud = fused_by_hand(SYSTEM, session, 2.0).fused(), result.cloud
+    assert cloud.points_mm.tobytes() == by_hand.points_mm.astype(np.float32).astype(np.float64).tobytes()
+    for name in ("count", "scans", "weight", "spread_mm", "normals", "uncertainty_mm", "voxel_mm"):
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(by_hand, name), err_msg=name)
+    assert np.isfinite(cloud.uncertainty_mm).all()
+    assert cloud.scans.max() == 3
+
+
+def test_threads_and_a_small_memory_change_no_byte_of_the_file(session: Session, tmp_path: Path) -> None:
+    written = []
+    for n_threads, memory_mb in ((1, 700.0), (2, 700.0), (4, 700.0), (2, 0.05)):
+        result = stitch(SYSTEM, session, tmp_path / "cloud.ply", settings=StitchSettings(0.2, memory_mb=memory_mb, n_threads=n_threads))
+        assert (result.n_tiles > 0) == (memory_mb < 1)
+        written.append((tmp_path / "cloud.ply").read_bytes())
+    assert len(set(written)) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]
 
 
 def test_joints_and_nominal_flange_poses_are_taken_as_the_calibration_wants(session: Session, tmp_path: Path) -> None:
-    with_poses = stitch(TrueSystem(paper_cell(), pose_only=True), session, tmp_path / "poses.ply", 1.0)
-    shot = session.shots[0]
-    points = read_ply(session.folder / str(shot.scan)).points_mm
-    grid = VoxelGrid(1.0)
-    for shot in session.shots:
-        points = read_ply(session.folder / str(shot.scan)).points_mm
-        grid.add(SYSTEM.points_in_base_mm(points, base_from_flange=shot.base_from_flange))
-    assert with_poses.cloud.points_mm.tobytes() == grid.fused().points_mm.tobytes()
+    pose_only = TrueSystem(paper_cell(), pose_only=True)
+    with_poses = stitch(pose_only, session, tmp_path / "poses.ply", 1.0)
+    by_hand = fused_by_hand(pose_only, session, 1.0).fused()
+    assert with_poses.cloud.points_mm.tobytes() == by_hand.points_mm.astype(np.float32).astype(np.float64).tobytes()
+    with_joints = stitch(SYSTEM, session, tmp_path / "joints.ply", 1.0).cloud
+    assert len(with_joints.count) != len(by_hand.count) or not np.allclose(with_joints.points_mm, by_hand.points_mm)
 
 
 def grid_scan(rng: np.random.Generator) -> FloatImage:
@@ -85,6 +101,7 @@ def test_organised_scans_lose_their_flying_pixels_and_keep_the_rest(tmp_path: Pa
     assert cleaned.n_points_in == raw.n_points_in == 40 * 30 - 1
     assert raw.n_edge_points == 0
     assert cleaned.n_edge_points == 30
+    assert cleaned.n_points_in == cleaned.cloud.count.sum() + 30
     assert raw.n_points - cleaned.n_points == 30
 
 
@@ -122,7 +139,10 @@ def one_scan(folder: Path, xyz_mm: FloatImage, *, joints: bool = True) -> Sessio
     ("xyz_mm", "joints", "message"),
     [
         (np.full((5, 3), np.nan), True, "no point is left of 0 valid"),
+        (np.zeros((0, 3)), True, "no point is left of 0 valid"),
+        (np.full((6, 8, 3), np.nan), True, "no point is left of 0 valid"),
         (np.array([[0.1, 0.2, 0.3]]), True, "probably in metres"),
+        (np.array([[1e5, 0.0, 4e5]]), True, "probably in micrometres"),
         (np.array([[0.0, 0.0, 300.0]]), False, "no joints"),
     ],
 )
@@ -133,6 +153,20 @@ def test_scans_that_cannot_be_used_are_told_with_their_place(tmp_path: Path, xyz
     assert caught.value.file is not None
     assert caught.value.remedy
     assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_one_good_point_is_a_cloud_and_empty_scans_and_far_points_are_told(tmp_path: Path) -> None:
+    with SessionWriter.create(tmp_path / "session", purpose="workpiece", cell=write_cell(tmp_path)) as writer:
+        mixed = np.array([[0.0, 0.0, 300.0], [0.0, 1e30, 300.0], [np.nan, 0.0, 300.0]])
+        for xyz in (np.full((4, 5, 3), np.nan), np.array([[3.0, 2.0, 300.0]]), mixed):
+            writer.append(joints_rad=np.zeros(6), xyz_mm=xyz.astype(np.float32))
+    result = stitch(SYSTEM, read_session(tmp_path / "session"), tmp_path / "cloud.ply")
+    told = result.to_json_dict()
+    assert (told["n_points"], told["n_points_in"], told["n_outside"], told["empty_shots"]) == (2, 3, 1, [0])
+    cloud = result.cloud
+    assert np.isnan(cloud.normals).all()
+    assert (cloud.spread_mm == 0).all()
+    assert (cloud.uncertainty_mm > 0).all()
 
 
 def test_a_changed_scan_leaves_no_file_behind(session: Session, tmp_path: Path) -> None:
@@ -152,3 +186,8 @@ def test_a_senseless_voxel_or_folder_is_told(session: Session, tmp_path: Path) -
         stitch(SYSTEM, session, tmp_path / "cloud.ply", 0.0)
     with pytest.raises(FileError):
         stitch(SYSTEM, session, tmp_path / "none" / "cloud.ply")
+    with pytest.raises(SettingsError, match=r"not written as \.xyz"):
+        stitch(SYSTEM, session, tmp_path / "cloud.xyz")
+    with pytest.raises(SettingsError, match="0 threads"):
+        stitch(SYSTEM, session, tmp_path / "cloud.ply", settings=StitchSettings(n_threads=0))
+    assert not list(tmp_path.iterdir())
