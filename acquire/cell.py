@@ -164,6 +164,8 @@ class Cell(StrictModel):
     motion: Motion = Motion()
     suspend: Suspend = Suspend()
     identity: dict[str, Scalar] = Field(default_factory=dict)
+    identity_mismatch: dict[Text, Literal["refuse", "mark"]] = Field(default_factory=dict)
+    """What happens where a calibration was made with something else under this key of `identity`."""
 
     _path: Path = PrivateAttr(default=Path("cell.yaml"))
     _data: bytes = PrivateAttr(default=b"")

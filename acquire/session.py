@@ -17,15 +17,17 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from acquire.cell import Cell, robot_model_of
+from acquire.identity import check_resumed
 from acquire.session_folder import check_free, check_same_cell, make_folder, open_locked, repair
 from drivers.errors import FileError, SettingsError
+from drivers.files.checks import as_mapping
 from drivers.files.disk import sha256_hex, write_atomic
 from drivers.files.ply import encode_ply
 from drivers.files.session import PURPOSES, SESSION_FORMAT, read_head
@@ -94,21 +96,23 @@ class SessionWriter:
             raise
 
     @classmethod
-    def resume(cls, folder: str | Path, *, cell: Cell | None = None) -> Self:
+    def resume(cls, folder: str | Path, *, cell: Cell | None = None, told: Mapping[str, str] = MappingProxyType({})) -> Self:
         """Go on with a session; a last line that a killed run left half-written is taken out and told in `repaired`.
 
         Args:
             folder: the session's folder.
             cell: the cell of the run; it must say the same as the session's copy.
+            told: what robot and camera tell of themselves (`Devices.identity`).
 
         Raises:
-            SettingsError: the cell or its robot model is another than the session's.
+            SettingsError: the cell or its robot model is another than the session's, or robot or camera are.
             FileError: the session is broken beyond its last line, or another process writes to it.
         """
         target = Path(folder)
-        read_head(target)
+        identity = read_head(target).get("identity") or {}
         if cell is not None:
             check_same_cell(target, cell)
+        check_resumed(as_mapping(identity, file=str(target / "session.yaml"), where="identity"), told, file=target / "session.yaml")
         stream = open_locked(target / "shots.jsonl")
         try:
             (target / "scans").mkdir(exist_ok=True)

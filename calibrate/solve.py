@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from acquire.cell import Cell, cell_of_session, robot_model_of
 from acquire.check import check_session
+from acquire.identity import check_one_system
 from calibrate.assemble import Assembled, assemble, without_pose_noise
 from calibrate.camera_error import CameraError, NoCameraError, camera_error_models
 from calibrate.camera_misfit import CameraMisfit, misfit_of
@@ -192,6 +193,7 @@ def cell_of_sessions(sessions: Sequence[Session]) -> tuple[Cell, RobotModel | No
                 remedy="Calibrate sessions of different cells apart, or give moved spheres their own names in one cell file.",
             )
         check_session(session, other, robot_model_of(other, session))
+    check_one_system(sessions)
     return cell, model
 
 

@@ -76,6 +76,10 @@ class RobotInfo:
     controller: str | None = None
     notes: tuple[str, ...] = ()
 
+    def identity(self) -> dict[str, str]:
+        """What is known of the part that a calibration is bound to, under the key of a cell's `identity`."""
+        return {} if self.serial is None else {"robot_serial": self.serial}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotState:
@@ -234,15 +238,23 @@ class Devices:
 
     robot: Robot
     camera: Camera3D
+    _told: dict[str, str] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """What robot and camera told of themselves when they were opened, under the keys of a cell's `identity`."""
+        return self._told
 
     def __enter__(self) -> Self:
         """Open both; the robot is closed again when the camera fails."""
-        self.robot.open()
+        robot = self.robot.open()
         try:
-            self.camera.open()
+            camera = self.camera.open()
         except BaseException:
             self.robot.close()
             raise
+        self._told.clear()
+        self._told.update(robot.identity() | camera.identity())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

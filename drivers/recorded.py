@@ -165,8 +165,13 @@ class RecordedCamera:
         self._open = True
         if not self._recording.robot_moves:
             self._recording.position = None
-        serial = session.identity.get("camera_serial")
-        return CameraInfo("recorded", serial=None if serial is None else str(serial))
+        known = {key: str(value) for key, value in session.identity.items() if value is not None}
+        return CameraInfo(
+            "recorded",
+            serial=known.get("camera_serial"),
+            settings_digest=known.get("camera_settings"),
+            onboard_correction=known.get("camera_correction"),
+        )
 
     def capture(self, *, timeout_s: float) -> Frame3D:
         """The recorded scan.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -51,9 +51,9 @@ def serve_cell(
         desk, interrupted = CellDesk(), False
         camera = devices_of(loaded).camera
         with ExitStack() as stack:
-            writer = stack.enter_context(_session(loaded, planned, out, purpose or _purpose(planned, sphere), resume))
             stack.callback(camera.close)
-            camera.open()
+            told = camera.open().identity()
+            writer = stack.enter_context(_session(loaded, planned, out, purpose or _purpose(planned, sphere), told, resume))
 
             def tell(job: Job) -> None:
                 run.console.note(_line(job, orders))
@@ -96,13 +96,17 @@ def _checked_sphere(cell: Cell, plan: Plan | None, sphere: str | None) -> str | 
 
 
 @contextmanager
-def _session(cell: Cell, plan: Plan | None, out: Path, purpose: str, resume: bool) -> Iterator[SessionWriter]:
+def _session(cell: Cell, plan: Plan | None, out: Path, purpose: str, told: Mapping[str, str], resume: bool) -> Iterator[SessionWriter]:
     """The session; taken away again when no picture came into it."""
+    from acquire.identity import identity_of_new_session
     from acquire.plan import plan_text
     from acquire.session import SessionWriter
 
-    text = None if plan is None else plan_text(plan)
-    writer = SessionWriter.resume(out, cell=cell) if resume else SessionWriter.create(out, purpose=purpose, cell=cell, plan_text=text)
+    if resume:
+        writer = SessionWriter.resume(out, cell=cell, told=told)
+    else:
+        text, identity = None if plan is None else plan_text(plan), identity_of_new_session(cell, told)
+        writer = SessionWriter.create(out, purpose=purpose, cell=cell, plan_text=text, identity=identity)
     try:
         with writer:
             yield writer

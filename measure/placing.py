@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from acquire.cell import Cell, Limits, cell_of_session, robot_model_of
 from acquire.check import check_session
+from acquire.identity import identity_marks
 from calibrate.normal import NoiseModel
 from calibrate.observations import SphereShot
 from calibrate.plausibility import check_reported_poses
@@ -26,6 +27,11 @@ class MeasuringSystem(Protocol):
     @property
     def id(self) -> str:
         """Digest that results carry."""
+        ...
+
+    @property
+    def identity(self) -> Mapping[str, object]:
+        """Serial numbers and the like of what was calibrated."""
         ...
 
     @property
@@ -114,18 +120,23 @@ class JudgedSystem(MeasuringSystem, Protocol):
         ...
 
 
-def check_fits(calibration: MeasuringSystem, session: Session, cell: Cell | None = None) -> None:
+def check_fits(calibration: MeasuringSystem, session: Session, cell: Cell | None = None) -> tuple[str, ...]:
     """Refuse sessions that this calibration cannot measure.
+
+    Returns:
+        How the robot and the camera differ from those that were calibrated, where the cell file lets that pass.
 
     Raises:
         FileError: the session does not fit its own cell: axes, units, names of spheres.
-        DataError: it was recorded with another robot, or its poses contradict its axis angles.
+        DataError: it was recorded with another robot or camera, with other settings or another payload, or its poses
+            contradict its axis angles.
     """
     cell = cell or cell_of_session(session)
     model = robot_model_of(cell, session)
     check_session(session, cell, model)
+    marks = identity_marks(calibration.identity, session, cell)
     if calibration.model is None or model is None:
-        return
+        return marks
     check_reported_poses([session], model)
     if not _same_geometry(calibration.model, model):
         raise DataError(
@@ -133,6 +144,7 @@ def check_fits(calibration: MeasuringSystem, session: Session, cell: Cell | None
             file=session.folder,
             remedy="Use the calibration of this robot.",
         )
+    return marks
 
 
 def _same_geometry(first: RobotModel, second: RobotModel) -> bool:

@@ -17,6 +17,7 @@ from acquire.capture import CaptureSettings, run_capture, settings_of
 from acquire.capture_states import RunState
 from acquire.cell import Cell, devices_of, robot_model_of
 from acquire.events import Command, Event, Finished, Moved
+from acquire.identity import identity_of_new_session
 from acquire.plan import Plan, plan_text
 from acquire.session import SessionWriter
 from acquire.session_folder import check_free
@@ -71,13 +72,13 @@ def capture_session(
         CameraError: likewise.
         DataError: a sphere is missing or the camera drifts, and nobody answered.
         FileError: the session or the cell's runs cannot be written, or the folder is not empty and not to be resumed.
-        SettingsError: the devices cannot be made, or `resume` with another cell.
+        SettingsError: the devices cannot be made, are others than the cell file says, or `resume` with another cell, robot or camera.
         KeyboardInterrupt: somebody or something wants the run to end now; the robot is stopped.
     """
     devices, how = devices_of(cell), settings or settings_of(cell)
     if not resume:
         check_free(out)  # before a robot is even connected
-    with devices, _session(cell, plan, out, resume) as writer, _recorded(cell, plan, out, how, stepped) as diary:
+    with devices, _session(cell, plan, out, devices.identity, resume) as writer, _recorded(cell, plan, out, how, stepped) as diary:
 
         def watch(event: Event) -> Command | None:
             diary.note(event)
@@ -132,10 +133,15 @@ def _recorded(cell: Cell, plan: Plan, out: Path, settings: CaptureSettings, step
             )
 
 
+def _begun(cell: Cell, plan: Plan, out: Path, told: Mapping[str, str]) -> SessionWriter:
+    identity = identity_of_new_session(cell, told)
+    return SessionWriter.create(out, purpose=plan.purpose, cell=cell, plan_text=plan_text(plan), identity=identity)
+
+
 @contextmanager
-def _session(cell: Cell, plan: Plan, out: Path, resume: bool) -> Iterator[SessionWriter]:
+def _session(cell: Cell, plan: Plan, out: Path, told: Mapping[str, str], resume: bool) -> Iterator[SessionWriter]:
     was_there = out.exists()
-    writer = SessionWriter.resume(out, cell=cell) if resume else SessionWriter.create(out, purpose=plan.purpose, cell=cell, plan_text=plan_text(plan))
+    writer = SessionWriter.resume(out, cell=cell, told=told) if resume else _begun(cell, plan, out, told)
     try:
         with writer:
             yield writer

@@ -70,8 +70,7 @@ def verify(
     """
     began = time.perf_counter()
     cells = [cell or cell_of_session(session) for session in sessions]
-    for session, its_cell in zip(sessions, cells, strict=True):
-        check_fits(calibration, session, its_cell)
+    marks = [mark for session, its_cell in zip(sessions, cells, strict=True) for mark in check_fits(calibration, session, its_cell)]
     flattery = _flattery(calibration, sessions, allowed=allow_training_data)
     observations = _gather(sessions, cells)
     artefact = artefact_when_seen(*_merged(cells), sessions)
@@ -89,7 +88,7 @@ def verify(
         sessions=tuple(SessionName(session.folder.name, session.digest) for session in sessions),
         before=before,
         before_length_errors_mm={} if before is None else _length_errors(before, artefact.lengths),
-        reasons=(*found.reasons, *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
+        reasons=(*found.reasons, *dict.fromkeys(marks), *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
         seconds=time.perf_counter() - began,
     )
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from drivers.errors import DataError, SettingsError
 from measure.jobs.failures import failure_of
-from measure.jobs.marks import identity_marks, trust_marks
+from measure.jobs.marks import trust_marks
 from measure.jobs.model import RESULT_FORMAT, Order, Outcome
 from measure.jobs.outputs import RESULT_FILE, attempt_folder, commit, read_result, result_folder
 
@@ -83,10 +83,11 @@ def _measured(order: Order, began: float) -> dict[str, object]:
 
 def _fill(order: Order, calibration: Calibration, session: Session, working: Path, began: float) -> str:
     """Measure into a folder; the text of its result.json."""
+    from acquire.identity import identity_marks
     from measure.console import json_text
     from measure.running_record import now_utc
 
-    marks = [*identity_marks(session, calibration.identity), *trust_marks(calibration.verdict, order.last_check)]
+    marks = [*identity_marks(calibration.identity, session), *trust_marks(calibration.verdict, order.last_check)]
     stitched = _stitched(order, calibration, session, working)
     result = {
         "format": RESULT_FORMAT,
