@@ -126,6 +126,8 @@ class Views:
     """(v, 3, 3)."""
     point_covariance_mm2: FloatArray
     """(v, 3, 3)."""
+    joints_rad: FloatArray | None = None
+    """(v, n) where the robot stands; None for pose-only calibrations."""
 
 
 def error_budget(
@@ -231,7 +233,7 @@ def views_at(
     points = se3.apply(se3.inverse(flange @ flange_from_camera), wanted[rows])
     jacobian = calibration.point_jacobian(points, joints_rad=joints) if len(rows) else np.zeros((0, 3, len(calibration.covariance)))
     pose, point = calibration.noise_covariances_mm2(points, flange)
-    return Views(place[rows], points, jacobian, pose, point)
+    return Views(place[rows], points, jacobian, pose, point, joints)
 
 
 def _nearest_solutions(calibration: Calibration, base_from_flange: FloatArray, near_rad: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:

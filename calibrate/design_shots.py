@@ -131,7 +131,7 @@ def ideal_caps(scene: Scene, joints_rad: FloatArray, sphere: IntArray) -> Caps:
     problem = scene.problem(joints_rad, sphere)
     geometry = linearise_geometry(problem, scene.nominal_state(problem.n_scans))
     centre, radius = geometry.centre_in_camera_mm, scene.radius_mm[sphere]
-    points = _cap_points(centre, radius) if scene.along_sight else _arc_points(centre, radius)
+    points = cap_points(centre, radius) if scene.along_sight else _arc_points(centre, radius)
     unit = (points - centre[:, None]) / radius[:, None, None]
     axis = scene.camera_error.axis
     basis = scene.camera_error.basis(points.reshape(-1, 3)).reshape(*unit.shape[:2], len(axis))
@@ -208,7 +208,7 @@ def _rows_of(scene: Scene, caps: Caps) -> FloatArray:
     return np.asarray(np.swapaxes(vectors[..., ::-1][..., :kept], -1, -2) @ whitened)
 
 
-def _cap_points(centre: FloatArray, radius: FloatArray) -> FloatArray:
+def cap_points(centre: FloatArray, radius: FloatArray) -> FloatArray:
     """(m, t, 3) points of caps that face the camera, spread evenly over their outline."""
     toward = -centre / np.linalg.norm(centre, axis=1, keepdims=True)
     across = np.cross(toward, np.where(np.abs(toward[:, :1]) < 0.7, [1.0, 0, 0], [0, 1.0, 0]))
