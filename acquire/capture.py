@@ -39,11 +39,12 @@ from acquire.events import (
     Stop,
     Suspended,
 )
+from acquire.identity import reopen_camera, reopen_robot
 from acquire.motion import RobotUnsettled, halt, read_safely
 from acquire.plan import Plan, PlannedPose
 from acquire.session import SessionWriter
 from acquire.way import Way
-from drivers.errors import CameraError, CameraNotReached, CameraTimeout, MotionRefused, RobotError, RobotNotReached, SettingsError, SpherecalError
+from drivers.errors import CameraError, CameraTimeout, MotionRefused, RobotError, RobotNotReached, SettingsError, SpherecalError
 from drivers.kinematics.mdh import RobotModel
 from drivers.protocols import Devices, Robot
 
@@ -59,7 +60,7 @@ def run_capture(
     the errors below come where nobody answers that.
 
     Args:
-        devices: opened; the run does not close them for good, but opens one anew after its link was lost and a Continue.
+        devices: opened; the run does not close them for good, but opens one anew after trouble and a Continue, if it is the same.
         cell: spheres, first guess of the hand-eye, kind of camera.
         plan: the poses, in this order.
         writer: the session.
@@ -264,13 +265,14 @@ class _Run:
             self._obey(command)
 
     def _put_right(self, error: SpherecalError) -> None:
-        """Somebody says that the trouble is over: open what was lost, and see that the robot may move."""
+        """Somebody says that the trouble is over: open what was lost, see that it is the same, and that the robot may move.
+
+        A camera is opened anew after whatever it was: that sets everything again, and no frame of an earlier trigger is left.
+        """
         if isinstance(error, RobotNotReached):
-            self._robot.close()
-            self._robot.open()
-        if isinstance(error, CameraNotReached):
-            self._devices.camera.close()
-            self._devices.camera.open()
+            reopen_robot(self._robot, self._devices.identity)
+        if isinstance(error, CameraError):
+            reopen_camera(self._devices.camera, self._devices.identity)
             self._taker.camera_opened_anew()
         read_safely(self._robot)
         self._errors_in_a_row = 0

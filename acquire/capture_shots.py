@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +14,14 @@ from acquire.motion import Stillness
 from acquire.plan import PlannedPose
 from acquire.session import SessionWriter
 from drivers.files.shots import Shot
+from drivers.protocols import Frame3D
 
 FloatArray = NDArray[np.float64]
+
+
+def diagnostics_of(frames: Sequence[Frame3D]) -> dict[str, float | int | str]:
+    """What the last frame tells of the camera and the way to it, as the line of a shot may hold it."""
+    return {name: value for name, value in frames[-1].diagnostics.items() if not isinstance(value, float) or math.isfinite(value)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +79,7 @@ class ShotBook:
             stillness_rad=None if before is None else before.stillness_rad,
             temperatures_c=frames[-1].temperatures_c if frames else None,
             approach=None if before is None else take.approach,
+            extra={"diagnostics": diagnostics_of(frames)} if frames and frames[-1].diagnostics else None,
         )
         if status == "ok" or not self.is_done(pose):
             self._last_by_id[pose.id] = shot

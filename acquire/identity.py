@@ -13,7 +13,7 @@ from pathlib import Path
 from acquire.cell import Cell, cell_of_session
 from drivers.errors import CameraMisconfigured, DataError, SettingsError, WrongController
 from drivers.files.session import Session
-from drivers.protocols import Devices
+from drivers.protocols import Camera3D, Robot
 
 BOUND: Mapping[str, str] = {
     "robot_serial": "the robot's serial number",
@@ -120,29 +120,37 @@ def check_one_system(sessions: Sequence[Session]) -> None:
         known = {**found, **known}
 
 
-def reopen_camera(devices: Devices) -> None:
+def reopen_camera(camera: Camera3D, known: Mapping[str, str]) -> None:
     """Open a camera anew, and see that it is the same one, set as before.
+
+    Args:
+        camera: that was lost, or gave trouble.
+        known: what it told of itself at first.
 
     Raises:
         CameraError: it cannot be opened; CameraMisconfigured: it is another one or set otherwise (it is closed again).
     """
-    devices.camera.close()
-    told = devices.camera.open().identity()
-    for difference in differences(devices.identity, told):
-        devices.camera.close()
+    camera.close()
+    told = camera.open().identity()
+    for difference in differences(known, told):
+        camera.close()
         remedy = "Connect the camera of the run's start, and set it as it was; or end the run and begin a new session."
         raise CameraMisconfigured(difference.text("the run was begun with"), remedy=remedy)
 
 
-def reopen_robot(devices: Devices) -> None:
+def reopen_robot(robot: Robot, known: Mapping[str, str]) -> None:
     """Connect to a robot anew, and see that it is the same one.
+
+    Args:
+        robot: whose link was lost.
+        known: what it told of itself at first.
 
     Raises:
         RobotError: it cannot be reached; WrongController: it is another one (the link is closed again).
     """
-    devices.robot.close()
-    told = devices.robot.open().identity()
-    for difference in differences(devices.identity, told):
-        devices.robot.close()
+    robot.close()
+    told = robot.open().identity()
+    for difference in differences(known, told):
+        robot.close()
         remedy = "Connect the robot of the run's start, or end the run and begin a new session."
         raise WrongController(difference.text("the run was begun with"), remedy=remedy)

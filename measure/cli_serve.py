@@ -58,7 +58,7 @@ def serve_cell(
             def tell(job: Job) -> None:
                 run.console.note(_line(job, orders))
 
-            worker = CellWorker(loaded, model, camera, writer, orders, tell, loaded.motion.frames)
+            worker = CellWorker(loaded, model, camera, writer, orders, tell, loaded.motion.frames, told=told)
             server = LineServer(desk)
             if serial_port is None:
                 at = stack.enter_context(server.over_tcp(host, port))

@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from acquire.capture_shots import diagnostics_of
 from acquire.cell import Cell
 from acquire.exposure import Exposure, average, expose
+from acquire.identity import reopen_camera
 from acquire.plan import PlannedPose
 from acquire.session import SessionWriter
 from acquire.sighting import base_from_flange_of, look_for, predicted_centre_in_camera_mm
 from acquire.sphere import SphereNotFound, SphereSettings
 from drivers.abb.answers import Answerer, Declined
 from drivers.abb.protocol import LAST_NUMBER, MASTER_VERBS, N_AXES, VERSION, Fault, Line, Verb, numbers, whole
-from drivers.errors import CameraError, SpherecalError
+from drivers.errors import CameraError, CameraLost, SpherecalError
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import Camera3D
@@ -129,8 +131,11 @@ class CellWorker:
     """Called when a job is done."""
     frames: int = 1
     sphere_settings: SphereSettings = field(default_factory=SphereSettings)
+    told: Mapping[str, str] = field(default_factory=dict)
+    """What the camera told of itself when it was opened; a lost one that comes back must tell the same."""
     counts: dict[str, int] = field(default_factory=lambda: {OK: 0, NG: 0})
     _sequence: int = -1
+    _lost: bool = False
     _last: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -138,11 +143,11 @@ class CellWorker:
         self._last = {shot.pose_id: shot.index for shot in self.writer.shots if shot.pose_id is not None and shot.status == "ok"}
 
     def work(self, waiting: queue.Queue[Job | None], most: int | None = None) -> None:
-        """Work until None comes, or so many pictures are good.
+        """Work until None comes, or so many pictures are good. A camera whose link was lost is opened anew for the next picture.
 
         Raises:
             FileError: the session cannot be written.
-            CameraError: the camera is gone or set wrongly, which another picture will not mend.
+            CameraError: the camera is set wrongly or not there, which another picture will not mend.
         """
         while (job := waiting.get()) is not None:
             self._take(job)
@@ -160,13 +165,17 @@ class CellWorker:
             exposure = self._expose()
         except CameraError as error:
             self._fail(job, sphere, str(error))
-            if not error.retryable:
+            self._lost = self._lost or isinstance(error, CameraLost)
+            if not (error.retryable or self._lost):
                 raise
             return
         job.state = EXPOSED
         self._judge(job, sphere, exposure)
 
     def _expose(self) -> Exposure:
+        if self._lost:
+            reopen_camera(self.camera, self.told)
+            self._lost, self._sequence = False, -1
         exposure = Exposure()
         while len(exposure.frames) < self.frames:
             exposure = expose(self.camera, exposure, after=self._sequence, timeout_s=_FRAME_TIMEOUT_S)
@@ -202,6 +211,7 @@ class CellWorker:
                 pose_id=pose_id,
                 replaces=self._last.get(pose_id) if reason is None else None,
                 temperatures_c=frames[-1].temperatures_c if frames else None,
+                extra={"diagnostics": diagnostics_of(frames)} if frames and frames[-1].diagnostics else None,
             )
         except SpherecalError as error:
             job.reason, job.state = str(error), NG

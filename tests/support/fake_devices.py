@@ -114,9 +114,11 @@ class FakeCamera:
         self.warms_k_per_frame = 0.0
         self.temperature_c = 31.5
         self.tells_temperature = True
+        self.info = CameraInfo("fake")
+        self.diagnostics: dict[str, float | int | str] = {}
 
     def open(self) -> CameraInfo:
-        return CameraInfo("fake")
+        return self.info
 
     def capture(self, *, timeout_s: float) -> Frame3D:
         del timeout_s
@@ -127,7 +129,9 @@ class FakeCamera:
         self.sequence += 1
         temperatures_c = {"housing": self.temperature_c} if self.tells_temperature else {}
         self.temperature_c += self.warms_k_per_frame
-        return Frame3D(xyz_mm=self.xyz_mm.copy(), sequence=self.sequence, time_s=0.0, temperatures_c=temperatures_c)
+        return Frame3D(
+            xyz_mm=self.xyz_mm.copy(), sequence=self.sequence, time_s=0.0, temperatures_c=temperatures_c, diagnostics=dict(self.diagnostics)
+        )
 
     def close(self) -> None:
         pass

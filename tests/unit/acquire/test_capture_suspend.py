@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +32,19 @@ from acquire.events import (
     WarmingUp,
 )
 from acquire.plan import PlannedPose
-from drivers.errors import CameraNotReached, CameraTimeout, MotionInterrupted, ProtectiveStop, RobotNotReached, SafetyStop, SpherecalError
+from drivers.errors import (
+    CameraLost,
+    CameraMisconfigured,
+    CameraNotReached,
+    CameraTimeout,
+    MotionInterrupted,
+    ProtectiveStop,
+    RobotNotReached,
+    SafetyStop,
+    SpherecalError,
+)
 from drivers.files.session import read_session
-from drivers.protocols import Safety
+from drivers.protocols import CameraInfo, Safety
 from tests.support.capture_bench import Answer, Bench, kinds, once, pose_ids
 from tests.support.fake_devices import FakeRobot, fake_plan
 
@@ -132,6 +144,33 @@ def test_a_camera_that_stays_away_suspends_again(bench: Bench) -> None:
     events = bench.run(fake_plan(1), clearing(bench))
     assert len(suspended(events)) == 3
     assert pose_ids(events) == ["p0"]
+
+
+def test_another_camera_than_the_one_that_was_lost_is_not_gone_on_with(bench: Bench) -> None:
+    bench.camera.info = right = CameraInfo("fake", serial="c1", settings_digest="abc")
+    bench.camera.faults = [None, CameraLost("cut")]
+    others = [replace(right, serial="c2"), replace(right, settings_digest="def"), right]
+
+    def answer(event: Event) -> Command | None:
+        if isinstance(event, Suspended):
+            bench.camera.info = others.pop(0)
+            return Continue()
+        return None
+
+    with bench.devices:
+        events = bench.run(fake_plan(3), answer)
+    assert [event.cause for event in suspended(events)] == [Cause.CAMERA] * 3
+    assert [type(event.error) for event in suspended(events)] == [CameraLost, CameraMisconfigured, CameraMisconfigured]
+    assert pose_ids(events) == ["p0", "p1", "p2"]
+    shots = read_session(bench.folder).shots
+    assert [shot.pose_id for shot in shots] == ["p0", "p1", "p2"]
+
+
+def test_what_the_camera_tells_of_its_link_is_kept_with_the_shot(bench: Bench) -> None:
+    bench.camera.diagnostics = {"packets_resent": 3, "file": "a.ply", "noise": float("nan")}
+    bench.run(fake_plan(1))
+    (line,) = (bench.folder / "shots.jsonl").read_text(encoding="utf-8").splitlines()
+    assert json.loads(line)["diagnostics"] == {"packets_resent": 3, "file": "a.ply"}
 
 
 def test_errors_in_a_row_begin_anew_after_a_continue(bench: Bench) -> None:

@@ -106,8 +106,11 @@ def test_sessions_of_two_cameras_are_not_solved_together(tmp_path: Path) -> None
 class Told(FakeCamera):
     """A camera that says who it is."""
 
-    info = CameraInfo("fake", serial="c1", settings_digest="abc")
     opened = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.info = CameraInfo("fake", serial="c1", settings_digest="abc")
 
     def open(self) -> CameraInfo:
         self.opened = True
@@ -130,13 +133,13 @@ def test_what_is_opened_anew_must_be_the_same() -> None:
     robot, camera = ToldRobot(), Told()
     with Devices(robot, camera) as devices:
         assert devices.identity == {"robot_serial": "r1", "camera_serial": "c1", "camera_settings": "abc"}
-        reopen_camera(devices)
-        reopen_robot(devices)
+        reopen_camera(camera, devices.identity)
+        reopen_robot(robot, devices.identity)
         assert camera.opened
         camera.info = replace(camera.info, settings_digest="def")
         with pytest.raises(CameraMisconfigured, match="settings is def, the run was begun with abc"):
-            reopen_camera(devices)
+            reopen_camera(camera, devices.identity)
         assert not camera.opened
         robot.info = RobotInfo("fake", serial="r2")
         with pytest.raises(WrongController, match="serial number is r2"):
-            reopen_robot(devices)
+            reopen_robot(robot, devices.identity)

@@ -22,8 +22,9 @@ from acquire.session import SessionWriter
 from drivers.abb.line import LineClient, Refusal
 from drivers.abb.program import module_text
 from drivers.abb.protocol import Code, Fault, Verb, angle_text, checksum, decode, encode
-from drivers.errors import CameraNotReached, CameraTimeout, SettingsError
+from drivers.errors import CameraLost, CameraNotReached, CameraTimeout, SettingsError
 from drivers.files.session import read_session
+from drivers.protocols import CameraInfo
 from drivers.transport import TcpLink
 from measure.serve import EXPOSING, NG, OK, CellDesk, CellWorker, Job, Orders
 from measure.serve_line import LineServer
@@ -139,6 +140,22 @@ def test_a_camera_that_fails_once_is_ng_and_one_that_is_gone_ends_the_service(ma
     with pytest.raises(CameraNotReached):
         serving.work()
     assert reply(serving.desk.answer(result(4, 3)))[1][1] == NG
+
+
+def test_a_camera_whose_link_was_lost_is_opened_anew_for_the_next_picture_if_it_is_the_same(make: Make) -> None:
+    camera = FakeCamera([None, CameraLost("cut")])
+    serving = make(Orders(), camera)
+    serving.worker.told = {"camera_serial": "c1"}
+    camera.info = CameraInfo("fake", serial="c2")
+    for i in range(1, 4):
+        serving.desk.answer(trigger(i, i))
+        serving.work()
+    assert serving.worker.counts == {OK: 1, NG: 2}
+    assert "is c2, the run was begun with c1" in str(read_session(serving.writer.folder).shots[-1].reason)
+    camera.info, camera.sequence = CameraInfo("fake", serial="c1"), 0
+    serving.desk.answer(trigger(4, 4))
+    serving.work()
+    assert serving.worker.counts == {OK: 2, NG: 2}
 
 
 def test_a_plan_says_which_sphere_and_where_the_robot_must_stand(make: Make) -> None:
@@ -288,8 +305,6 @@ def test_the_rapid_job_gives_up_where_nobody_serves() -> None:
     world = JobWorld(port)
     assert world.machine.call("SphTrigger", np.float32(1)) is False
     assert world.journal == ["spherecal does not answer"]
-
-
 
 
 def urscript() -> dict[str, Any]:
