@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from measure.cli_history import HistoryPlace, marked
 from measure.cli_run import AsJson, Debug, Quiet, command
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ def verify(
     calibration: CalibrationFile,
     sessions: SessionFolders,
     allow_training_data: Annotated[bool, typer.Option("--allow-training-data", help="Take shots of the calibration itself too.")] = False,
+    history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -29,12 +31,17 @@ def verify(
     with command(as_json, debug, quiet) as run:
         from calibrate import Calibration
         from drivers.files.session import read_session
+        from measure.history.recording import last_taken_utc, place_of, record_result
         from measure.verify import verify as verify_sessions
 
-        loaded = Calibration.load(calibration)
-        result = verify_sessions(loaded, [read_session(folder) for folder in sessions], allow_training_data=allow_training_data)
+        loaded, place = Calibration.load(calibration), place_of(history, calibration)
+        read = [read_session(folder) for folder in sessions]
+        result = verify_sessions(loaded, read, allow_training_data=allow_training_data)
         tell_verification(run.console, result)
-        run.finish(result.to_json_dict(), verdict=result.verdict)
+        taken_utc = last_taken_utc(read)
+        told = {**result.to_json_dict(), "marked": marked(run.console, place, loaded, taken_utc)}
+        kept = record_result(place, "verification", loaded, calibration, told, run.console.note, taken_utc=taken_utc)
+        run.finish({**told, "history": kept}, verdict=result.verdict)
 
 
 def tell_verification(console: Console, result: VerifyResult) -> None:
@@ -132,6 +139,7 @@ def stitch(
     out: Annotated[Path, typer.Option("--out", "-o", help="The cloud to write (PLY, mm, robot base).")] = Path("cloud.ply"),
     voxel: Annotated[float, typer.Option("--voxel", metavar="MM", help="Edge of the voxels: one point each.")] = 0.5,
     keep_edges: Annotated[bool, typer.Option("--keep-edges", help="Keep flying pixels at depth edges.")] = False,
+    history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -140,10 +148,14 @@ def stitch(
     with command(as_json, debug, quiet) as run:
         from calibrate import Calibration
         from drivers.files.session import read_session
+        from measure.history.recording import last_taken_utc, place_of
         from measure.stitch import stitch as stitch_session
 
         loaded, read = Calibration.load(calibration), read_session(session)
         with run.console.progress("stitching") as advance:
             result = stitch_session(loaded, read, out, voxel, clean_edges=not keep_edges, on_progress=advance)
         run.console.say(f"{result.n_points} points of {result.n_points_in} read, from {result.n_scans} scans, in {out} ({result.seconds:.1f} s)")
-        run.finish(result.to_json_dict())
+        for mark in result.marks:
+            run.console.note(mark)
+        doubts = marked(run.console, place_of(history, calibration), loaded, last_taken_utc([read]))
+        run.finish({**result.to_json_dict(), "marked": doubts})

@@ -22,14 +22,16 @@ class For(StrEnum):
     calibrate = "calibrate"
     verify = "verify"
     workpiece = "workpiece"
+    check = "check"
 
 
-_PURPOSES: dict[For, Purpose] = {For.calibrate: "calibration", For.verify: "verification", For.workpiece: "workpiece"}
+_POSES = 40
+_PURPOSES: dict[For, Purpose] = {For.calibrate: "calibration", For.verify: "verification", For.workpiece: "workpiece", For.check: "verification"}
 
 
 def plan(
     cell: Annotated[Path, typer.Argument(help="The cell file.")],
-    n: Annotated[int, typer.Option("-n", min=1, help="Poses wanted, shared among the spheres.")] = 40,
+    n: Annotated[int | None, typer.Option("-n", min=1, help="Poses wanted, shared among the spheres; 40, for a check 8, if left out.")] = None,
     purpose: Annotated[For, typer.Option("--for", help="What the poses are for.")] = For.calibrate,
     out: Annotated[Path, typer.Option("--out", "-o", help="The plan to write.")] = Path("plan.yaml"),
     sphere: Annotated[list[str] | None, typer.Option("--sphere", help="Look at this sphere. Repeat; all if left out.")] = None,
@@ -53,14 +55,26 @@ def plan(
         from measure.planning import PlanSettings, make_plan
 
         box = None if region is None else np.array(region).reshape(2, 3)
-        settings = PlanSettings(_PURPOSES[purpose], n, tuple(sphere or ()), box, seed, _expectation(calibration))
-        result = make_plan(load_cell(cell), settings)
+        settings = PlanSettings(_PURPOSES[purpose], n or _POSES, tuple(sphere or ()), box, seed, expectation=_expectation(calibration))
+        result = make_plan(load_cell(cell), settings) if purpose is not For.check else _check_plan(cell, calibration, sphere or [], n, seed)
         with replacing(out, PLAN_FORMAT) as former:
             write_plan(result.plan, out)
         if former is not None and former.exists():
             run.console.note(f"the earlier {out} was kept as {former}")
         _tell(run.console, result, out)
         run.finish({**result.to_json_dict(), "out": out})
+
+
+def _check_plan(cell: Path, calibration: Path | None, spheres: list[str], n: int | None, seed: int) -> PlanResult:
+    from acquire.cell import load_cell
+    from calibrate import Calibration
+    from drivers.errors import SettingsError
+    from measure.quick.planning import N_POSES, plan_check
+
+    if calibration is None:
+        remedy = "Give --calibration calibration.yaml."
+        raise SettingsError("a check is planned for the calibration that it checks", where="--calibration", remedy=remedy)
+    return plan_check(load_cell(cell), Calibration.load(calibration), spheres, n or N_POSES, seed)
 
 
 def _expectation(calibration: Path | None) -> Expectation | None:
@@ -78,3 +92,8 @@ def _tell(console: Console, result: PlanResult, out: Path) -> None:
     if length_mm is not None:
         centre = "" if centre_mm is None else f", centre of one view {centre_mm:.3f} mm"
         console.say(f"expected of a calibration from them, one sigma: lengths over the work volume {length_mm:.3f} mm{centre}")
+    separations = result.plan.predicted.get("separation_sigmas")
+    if isinstance(separations, dict):
+        told = ", ".join(f"{name} {value:.1f}" for name, value in separations.items())
+        console.say(f"how far each change stands out from the others, standard deviations: {told}")
+        console.say(f"the run takes about {result.plan.predicted.get('seconds')} s at 3 s a scan")

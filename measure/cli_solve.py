@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from measure.cli_history import HistoryPlace
 from measure.cli_measure import SessionFolders, tell_rejected, tell_verdict
 from measure.cli_run import AsJson, Debug, Quiet, command
 
@@ -107,6 +108,7 @@ def calibrate(
     robot_terms: Annotated[
         ArmTerms, typer.Option("--robot-terms", help="Terms of the arm beyond link twists: those that held-out shots want, or none.")
     ] = ArmTerms.auto,
+    history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -117,6 +119,7 @@ def calibrate(
         from calibrate.solve import calibrate as calibrate_sessions
         from drivers.files.session import read_session
         from measure.files import require_writable
+        from measure.history.recording import place_of, record_calibration
 
         require_writable(out)
         read = [read_session(folder) for folder in sessions]
@@ -131,7 +134,8 @@ def calibrate(
             run.console.say(f"to take the next best poses: copy the entries of next_best_poses in {out} to poses: of a plan for `spherecal capture`,")
             run.console.say("and calibrate the old and the new session together")
         run.console.say(f"written to {out}; prove it on other shots: spherecal verify {out} SESSION")
-        run.finish({"method": method.value, **calibration.to_json_dict(), "out": out}, verdict=calibration.verdict)
+        kept = record_calibration(place_of(history, out), calibration, out, run.console.note)
+        run.finish({"method": method.value, **calibration.to_json_dict(), "out": out, "history": kept}, verdict=calibration.verdict)
 
 
 def save_calibration(calibration: Calibration, out: Path) -> Path | None:

@@ -1,0 +1,1 @@
+"""Versions of the history's tables, for alembic."""

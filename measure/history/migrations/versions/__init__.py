@@ -1,0 +1,1 @@
+"""One module for each version; never changed after it was released."""
