@@ -7,10 +7,15 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drivers.files.disk import write_text_atomic
 from measure.jobs.journal import HeldPart, JobRecord, State
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 PAGE = "throughput.html"
 _HOURS = 48
@@ -115,13 +120,9 @@ def write_page(out: Path, state: State, *, is_running: bool, now: datetime.datet
 
 def render(state: State, *, is_running: bool, now: datetime.datetime, folder: Path) -> str:
     """The HTML text; every text on it is escaped."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     figures = throughput(state, now)
     jobs = list(state.jobs.values())
-    environment = Environment(loader=PackageLoader("measure"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"duration": duration_text, "moment": lambda time_utc: time_utc[:16].replace("T", " ")}
-    return environment.get_template("jobs.html.j2").render(
+    return _template().render(
         figures=figures,
         folder=str(folder),
         is_running=is_running,
@@ -136,6 +137,16 @@ def render(state: State, *, is_running: bool, now: datetime.datetime, folder: Pa
         held_ages={part.source: _age_s(part.since_utc, now) for part in state.held.values()},
         now=now.isoformat(timespec="seconds").replace("+00:00", "Z"),
     )
+
+
+@lru_cache(maxsize=1)
+def _template() -> Template:
+    """The page's template, compiled once a process: a runner draws the page again and again."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(loader=PackageLoader("measure"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"duration": duration_text, "moment": lambda time_utc: time_utc[:16].replace("T", " ")}
+    return environment.get_template("jobs.html.j2")
 
 
 def hours_chart(jobs: Sequence[JobRecord], now: datetime.datetime) -> Chart:

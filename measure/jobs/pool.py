@@ -7,7 +7,6 @@ end by themselves when the runner is killed.
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import signal
@@ -175,7 +174,7 @@ class LocalPool:
             self._finished.append((worker.ticket, Outcome(seconds, f"process {worker.process.pid}", failure=why)))
         elif not worker.ready:
             self._n_stillborn += 1
-            if self._n_stillborn > self._n_workers + 2:
+            if self._n_stillborn > self._n_workers:
                 msg = f"workers end before they are ready ({_how_it_ended(worker.process.exitcode)})"
                 raise RuntimeError(msg)
 
@@ -205,7 +204,6 @@ def _serve(pipe: Connection, work: Work, on_start: OnStart | None, threads: int)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    importlib.import_module("measure.jobs.work")
     if on_start is not None:
         on_start()
     with suppress(EOFError, OSError):  # the runner closed the pipe: it wants no more

@@ -1,10 +1,9 @@
-"""Many small parts for the tests of jobs, some of them spoiled, and work that misbehaves on order."""
+"""Many small parts for the tests of jobs, some of them spoiled, and a runner in this process."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,10 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.result import Calibration
 from drivers.files.disk import sha256_hex
 from drivers.files.ply import encode_ply
-from drivers.files.yaml import dump_yaml, load_yaml
-from measure.jobs.model import Failure, Order, Outcome
+from drivers.files.yaml import dump_yaml
+from measure.jobs.marks import Checks, no_history
+from measure.jobs.model import Files, Order, Outcome, Recipe, Work
+from measure.jobs.outputs import keep_copy, prepare
+from measure.jobs.parts import parts_in
+from measure.jobs.pool import Executor
+from measure.jobs.runner import Runner, RunSettings, Summary
 from measure.jobs.work import measure_part
 from tests.support.recorded import nominal_calibration, record_session, write_cell
 
@@ -40,14 +45,15 @@ def make_parts(folder: Path, n_parts: int, n_spoiled: int, seed: int) -> Parts:
     first = record_session(folder / "first", cell, rng, shots_per_sphere=2)
     calibration = replace(nominal_calibration(cell, [first]), identity={"camera_serial": CAMERA})
     calibration.save(folder / "calibration.yaml")
+    models = [record_session(folder / f"model{i}", cell, rng, shots_per_sphere=1, n_points=200, purpose="workpiece").folder for i in range(3)]
     damaged = rng.choice(n_parts, n_spoiled, replace=False)
     kinds = {int(place): list(DAMAGE)[i % len(DAMAGE)] for i, place in enumerate(damaged)}
     good, spoiled = [], {}
     for i in range(n_parts):
         name = f"part{i:04d}"
         session = folder / "parts" / name
-        record_session(session, cell, rng, shots_per_sphere=1, n_points=200, purpose="workpiece")
-        edit_head(session, {"camera_serial": CAMERA})
+        shutil.copytree(models[i % len(models)], session)
+        edit_head(session, {"camera_serial": CAMERA, "part": name})
         if i in kinds:
             DAMAGE[kinds[i]](session)
             spoiled[name] = kinds[i]
@@ -57,9 +63,8 @@ def make_parts(folder: Path, n_parts: int, n_spoiled: int, seed: int) -> Parts:
 
 
 def edit_head(session: Path, identity: dict[str, str]) -> None:
-    head = load_yaml(session / "session.yaml")
-    assert isinstance(head, dict)
-    (session / "session.yaml").write_text(dump_yaml({**head, "identity": identity}), encoding="utf-8")
+    head = (session / "session.yaml").read_text(encoding="utf-8").split("identity:")[0]
+    (session / "session.yaml").write_text(head + dump_yaml({"identity": identity}), encoding="utf-8")
 
 
 def read_lines(session: Path) -> list[dict[str, object]]:
@@ -110,25 +115,54 @@ DAMAGE: dict[str, Callable[[Path], None]] = {
 }
 
 
-def measure_slowly(order: Order) -> Outcome:
-    """The real work, with time to be killed in."""
-    time.sleep(0.05)
-    return measure_part(order)
+class InPlace:
+    """An executor that does each job when it is submitted, in this process."""
+
+    def __init__(self, work: Work = measure_part, n_workers: int = 1) -> None:
+        self.work, self.n_workers = work, n_workers
+        self.orders: list[Order] = []
+        self.most_flying = 0
+        self._ended: list[tuple[str, Outcome]] = []
+
+    @property
+    def n_free(self) -> int:
+        return self.n_workers - len(self._ended)
+
+    def submit(self, ticket: str, order: Order) -> None:
+        self.orders.append(order)
+        self._ended.append((ticket, self.work(order)))
+        self.most_flying = max(self.most_flying, len(self._ended))
+
+    def collect(self, timeout_s: float) -> list[tuple[str, Outcome]]:
+        if not self._ended:
+            time.sleep(min(timeout_s, 0.02))
+        ended, self._ended = self._ended, []
+        return ended
+
+    def close(self) -> None:
+        pass
 
 
-def moody(order: Order) -> Outcome:
-    """Does what the part's name asks for; a file in OUT counts its attempts."""
-    count = order.out / f"attempts-{order.job.part}"
-    with count.open("a", encoding="utf-8") as stream:
-        stream.write(f"{order.attempt}\n")
-    n_attempts = len(count.read_text(encoding="utf-8").splitlines())
-    word = order.job.part.split("-")[0]
-    if word == "dies" or (word == "dies_once" and n_attempts == 1):
-        os.kill(os.getpid(), signal.SIGKILL)
-    if word == "hangs_once" and n_attempts == 1:
-        time.sleep(60)
-    if word == "passes" and n_attempts < 3:
-        return Outcome(0.0, "here", failure=Failure("disk or network", "the share is gone", transient=True))
-    if word == "fails":
-        return Outcome(0.0, "here", failure=Failure("disk or network", "the share is gone", transient=True))
-    return measure_part(order)
+def run_jobs(
+    parts: Parts,
+    out: Path,
+    executor: Executor | None = None,
+    *,
+    recipe: Recipe | None = None,
+    checks: Checks = no_history,
+    on_made: Callable[[Runner], None] | None = None,
+    retry_dead: bool = False,
+    memory_mb: float | None = None,
+    give_up_after_s: float = 3600.0,
+) -> Summary:
+    """Drain a folder in this process."""
+    settings = RunSettings(
+        once=True, settle_s=0.0, poll_s=0.01, back_off_s=0.01, retry_dead=retry_dead, memory_mb=memory_mb, give_up_after_s=give_up_after_s
+    )
+    prepare(out)
+    copy, _ = keep_copy(out, parts.calibration)
+    given = recipe or Recipe(Calibration.load(copy).id)
+    runner = Runner(out, given, Files(copy), lambda: parts_in(parts.folder), executor or InPlace(), settings, checks=checks)
+    if on_made is not None:
+        on_made(runner)
+    return runner.run()
