@@ -203,6 +203,24 @@ class Frame3D:
     """Whatever tells how well the transport works: lost and resent packets, file name, frame number of the camera."""
 
 
+@dataclass(frozen=True, slots=True)
+class CameraHealth:
+    """How a camera that is open is, without taking a picture."""
+
+    temperatures_c: Mapping[str, float] = field(default_factory=dict)
+    link: Mapping[str, float | int | str] = field(default_factory=dict)
+    """Counters of the way to it, as in `Frame3D.diagnostics`: packets lost and sent again, since the stream began."""
+
+
+@runtime_checkable
+class TellsHealth(Protocol):
+    """What a camera that can tell how it is has besides `Camera3D`; ask with `isinstance`."""
+
+    def health(self) -> CameraHealth:
+        """How it is now. Raises CameraNotReached when it is not open or does not answer."""
+        ...
+
+
 @runtime_checkable
 class Camera3D(Protocol):
     """A 3D camera that gives one fresh frame per call (docs/add_a_camera.md; `drivers.contract.camera` tests it).

@@ -17,7 +17,7 @@ from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.models import load_robot_model, shipped_models
 from drivers.protocols import Camera3D, Mode, Robot, RobotState
-from measure.doctor_camera import camera_hints, frame_facts, identity_problems, info_facts
+from measure.doctor_camera import camera_hints, frame_facts, health_facts, identity_problems, info_facts
 
 Facts: TypeAlias = dict[str, object]
 
@@ -190,7 +190,10 @@ def examine_camera(camera: Camera3D, cell: Cell, diagnosis: Diagnosis) -> None:
     try:
         try:
             info = camera.open()
-            frame = camera.capture(timeout_s=FRAME_TIMEOUT_S)
+            try:
+                frame = camera.capture(timeout_s=FRAME_TIMEOUT_S)
+            finally:
+                diagnosis.camera.update(health_facts(camera))
         finally:
             camera.close()
     except SpherecalError as error:

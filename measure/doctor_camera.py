@@ -7,8 +7,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from acquire.identity import differences
 from drivers.cameras.frames import frame_problems
-from drivers.protocols import CameraInfo, Frame3D
+from drivers.errors import CameraError
+from drivers.protocols import Camera3D, CameraInfo, Frame3D, TellsHealth
 
 Facts: TypeAlias = dict[str, object]
 
@@ -33,15 +35,23 @@ def info_facts(info: CameraInfo) -> Facts:
 def identity_problems(info: CameraInfo, identity: Mapping[str, object], kind: str) -> list[str]:
     """Where the camera is another, or is set otherwise, than the cell file says; what either does not tell is no fault."""
     problems = []
-    for key, found in info.identity().items():
-        expected = identity.get(key)
-        if expected is not None and str(expected) != found:
-            what = key.removeprefix("camera_").replace("_", " ")
-            remedy = f"Connect that camera and set it so, or correct identity.{key} and calibrate again"
-            problems.append(f"its {what} is {found}, the cell file says {expected}. {remedy}.")
+    for difference in differences(identity, info.identity()):
+        remedy = f"Connect that camera and set it so, or correct identity.{difference.key} and calibrate again"
+        problems.append(f"{difference.text('the cell file says')}. {remedy}.")
     if info.kind != kind:
         problems.append(f"it is a {info.kind} camera, the cell file says {kind}. Correct camera.kind.")
     return problems
+
+
+def health_facts(camera: Camera3D) -> Facts:
+    """What a camera tells of itself, picture or not; nothing where it tells nothing."""
+    if not isinstance(camera, TellsHealth):
+        return {}
+    try:
+        told = camera.health()
+    except CameraError:
+        return {}  # whatever it is, the capture tells it
+    return {"health": {"temperatures_c": dict(told.temperatures_c), "link": dict(told.link)}}
 
 
 def frame_facts(frame: Frame3D, working_range_mm: tuple[float, float] | None) -> tuple[Facts, list[str]]:

@@ -20,7 +20,7 @@ from drivers.cameras.frames import require_serial, settings_digest
 from drivers.cameras.realsense_settings import RealsenseSettings
 from drivers.cameras.settings import parse_settings
 from drivers.errors import CameraBusy, CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, CameraTimeout
-from drivers.protocols import CameraInfo, Frame3D
+from drivers.protocols import CameraHealth, CameraInfo, Frame3D
 from drivers.registry import DriverContext
 
 _QUEUE = 8
@@ -232,6 +232,19 @@ class RealsenseCamera:
             device_time_ns=int(1e6 * frame.get_timestamp()),
             diagnostics={"frame_number": frame.get_frame_number(), "time_domain": str(frame.get_frame_timestamp_domain())},
         )
+
+    def health(self) -> CameraHealth:
+        """The temperatures of its sensors.
+
+        Raises:
+            CameraNotReached: not open, or it does not answer.
+        """
+        if self._sensor is None:
+            raise CameraNotReached("the camera is not open", remedy="Open it first.")
+        try:
+            return CameraHealth(self._temperatures())
+        except RuntimeError as error:
+            raise CameraLost(f"the camera does not answer ({error})", remedy="Check the USB cable, and open it anew.") from error
 
     def _temperatures(self) -> dict[str, float]:
         options = {name: getattr(self._rs.option, f"{name}_temperature") for name in _TEMPERATURES}

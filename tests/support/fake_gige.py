@@ -30,7 +30,7 @@ _LOCK = Path(tempfile.gettempdir()) / "spherecal-fake-gige.lock"
 _FILL = CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
 _WIDTH, _HEIGHT, _ACQUISITION, _PIXEL_FORMAT, _SOFTWARE_TRIGGER = 0x100, 0x104, 0x124, 0x128, 0x30C
 _UNIT, _REFERENCE, _MODE, _INVALID_FLAG = 0x8000, 0x8004, 0x8008, 0x800C
-_SCALE, _OFFSET, _INVALID, _STEP = 0x8100, 0x8200, 0x8300, 0x20
+_SCALE, _OFFSET, _INVALID, _TEMPERATURE, _STEP = 0x8100, 0x8200, 0x8300, 0x8400, 0x20
 _GENICAM = 'NameSpace="Standard"'
 
 
@@ -59,6 +59,9 @@ def _description(plain: str) -> str:
         _float("Scan3dCoordinateScale", _SCALE),
         _float("Scan3dCoordinateOffset", _OFFSET),
         _float("Scan3dInvalidDataValue", _INVALID),
+        f'<Float Name="DeviceTemperature" {_GENICAM}><pValue>DeviceTemperatureRegister</pValue></Float>',
+        f'<FloatReg Name="DeviceTemperatureRegister"><Address>{_TEMPERATURE:#x}</Address><Length>8</Length><AccessMode>RO</AccessMode>'
+        "<pPort>Device</pPort><Endianess>BigEndian</Endianess></FloatReg>",
     ]
     entry = f'<EnumEntry Name="Coord3D_ABC32f" {_GENICAM}><Value>{ABC32F}</Value></EnumEntry>'
     with_format = plain.replace("<pValue>PixelFormatRegister</pValue>", f"{entry}<pValue>PixelFormatRegister</pValue>")
@@ -116,6 +119,10 @@ class FakeGige:
     def measure_in_pixels(self) -> None:
         """Somebody sets another unit."""
         self.write(_UNIT, 2)
+
+    def warm_to(self, temperature_c: float) -> None:
+        """Its housing has this temperature."""
+        self._write_double(_TEMPERATURE, temperature_c)
 
     def lose(self, ratio: float) -> None:
         """A part of the stream's packets is never sent."""

@@ -8,12 +8,12 @@ from dataclasses import asdict
 
 from drivers.cameras.frames import require_plausible, require_serial, settings_digest
 from drivers.cameras.genicam.decode import decode
-from drivers.cameras.genicam.scan3d import Scan3d, problems, read_scan3d
+from drivers.cameras.genicam.scan3d import Scan3d, device_temperatures_c, problems, read_scan3d
 from drivers.cameras.genicam.settings import GenicamSettings
 from drivers.cameras.genicam.transport import DeviceIdentity, Payload, Transport
 from drivers.cameras.points import parse_axes
 from drivers.errors import CameraLost, CameraMisconfigured, CameraNotReached, CameraTimeout, IncompleteFrame, StaleFrame
-from drivers.protocols import CameraInfo, Frame3D
+from drivers.protocols import CameraHealth, CameraInfo, Frame3D
 
 _COMPONENTS = ("Range", "Confidence", "Intensity")
 
@@ -83,6 +83,16 @@ class GenicamCamera:
         except BaseException:
             self._end_stream()
             raise
+
+    def health(self) -> CameraHealth:
+        """Its temperature, where it has the feature DeviceTemperature, and the counters of the stream.
+
+        Raises:
+            CameraNotReached: not open, or (CameraLost) it does not answer any more.
+        """
+        if self._lost is not None or not self._opened:
+            raise CameraNotReached(self._lost or "the camera is not open", remedy="Open it first.")
+        return CameraHealth(device_temperatures_c(self._transport.get), dict(self._transport.statistics()))
 
     def close(self) -> None:
         """End the stream and give the camera back."""
@@ -209,6 +219,7 @@ class GenicamCamera:
             xyz_mm=decoded.xyz_mm,
             sequence=self._sequence,
             time_s=triggered_s,
+            temperatures_c=device_temperatures_c(self._transport.get),
             intensity=decoded.intensity,
             quality=decoded.confidence,
             quality_kind=None if decoded.confidence is None else "confidence",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -88,6 +89,17 @@ def _coordinate(get: Get, put: Set, axis: str) -> Coordinate:
 def _pinhole(get: Get) -> Pinhole | None:
     focal, u, v, aspect = (_number(get(f"Scan3d{name}")) for name in ("FocalLength", "PrincipalPointU", "PrincipalPointV", "AspectRatio"))
     return None if not focal or u is None or v is None else Pinhole(focal, u, v, aspect or 1.0)
+
+
+def device_temperatures_c(get: Get) -> dict[str, float]:
+    """The camera's temperature under the name of the sensor that is selected (`device` where there is one only); {} where it tells none.
+
+    The selector is left alone: writing it for every frame costs more than the other sensors tell.
+    """
+    value = _number(get("DeviceTemperature"))
+    if value is None or not math.isfinite(value):
+        return {}
+    return {(get("DeviceTemperatureSelector") or "device").lower(): value}
 
 
 def _number(text: str | None) -> float | None:

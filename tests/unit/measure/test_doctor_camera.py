@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.cameras.folder import make_camera
-from drivers.protocols import CameraInfo, Frame3D
+from drivers.errors import CameraTimeout
+from drivers.protocols import CameraHealth, CameraInfo, Frame3D
 from drivers.registry import DriverContext
 from measure.doctor import Diagnosis, examine_camera
 from measure.doctor_camera import camera_hints, frame_facts, identity_problems
@@ -33,9 +34,9 @@ def test_a_healthy_camera(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("identity", "said"),
     [
-        ({"camera_serial": "8"}, "its serial is 7, the cell file says 8"),
-        ({"camera_settings": "abd"}, "its settings is abc"),
-        ({"camera_correction": "2025"}, "its correction is 2026"),
+        ({"camera_serial": "8"}, "the camera's serial number is 7, the cell file says 8"),
+        ({"camera_settings": "abd"}, "the digest of the camera's settings is abc"),
+        ({"camera_correction": "2025"}, "the camera's own correction is 2026"),
     ],
 )
 def test_another_camera_or_other_settings(identity: dict[str, object], said: str) -> None:
@@ -77,3 +78,20 @@ def test_a_camera_that_is_not_there(tmp_path: Path) -> None:
     (problem,) = found.problems
     assert problem.startswith("camera: ")
     assert "cannot be read" in problem
+
+
+class Telling(FakeCamera):
+    """A camera that tells how it is; a picture may fail all the same."""
+
+    def health(self) -> CameraHealth:
+        return CameraHealth({"housing": 48.0}, {"packets_missing": 7})
+
+
+def test_how_a_camera_is_is_told_although_no_picture_comes(tmp_path: Path) -> None:
+    found = Diagnosis({}, {})
+    examine_camera(Telling([CameraTimeout("nothing came")]), fake_cell(tmp_path), found)
+    assert found.camera["health"] == {"temperatures_c": {"housing": 48.0}, "link": {"packets_missing": 7}}
+    assert found.problems == ["camera: nothing came"]
+    found = Diagnosis({}, {})
+    examine_camera(FakeCamera(), fake_cell(tmp_path), found)
+    assert "health" not in found.camera

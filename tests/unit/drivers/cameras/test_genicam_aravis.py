@@ -20,7 +20,8 @@ from drivers.cameras.genicam.camera import GenicamCamera
 from drivers.cameras.genicam.receive_buffer import make_room
 from drivers.contract.camera import CameraContract, CameraRig
 from drivers.contract.camera_rig import opened_camera
-from drivers.errors import CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, SettingsError
+from drivers.errors import CameraError, CameraLost, CameraMisconfigured, CameraNotReached, CameraSdkMissing, CameraTimeout, SettingsError
+from drivers.protocols import CameraHealth, TellsHealth
 from drivers.registry import DriverContext
 from tests.support.fake_gige import ADDRESS, FakeGige, fake_gige
 from tests.support.scan_scene import RADIUS_MM, ScanScene
@@ -170,6 +171,27 @@ def test_settings_that_do_not_fit_the_camera(bench: Bench, settings: dict[str, o
     with pytest.raises(kind, match=said) as caught:
         open_and_capture()
     assert caught.value.remedy
+    camera.close()
+
+
+def test_how_it_is_is_told_with_every_frame_and_without_one(bench: Bench) -> None:
+    bench.fake.warm_to(41.5)
+    camera = camera_of()
+    with pytest.raises(CameraNotReached):
+        camera.health()
+    camera.open()
+    assert isinstance(camera, TellsHealth)
+    assert camera.health() == CameraHealth({"device": 41.5}, {})
+    assert camera.capture(timeout_s=3).temperatures_c == {"device": 41.5}
+    bench.fake.lose(1.0)
+    with pytest.raises(CameraTimeout):
+        camera.capture(timeout_s=0.3)
+    bench.fake.lose(0.0)
+    camera.capture(timeout_s=3)
+    bench.fake.warm_to(43)
+    told = camera.health()
+    assert told.temperatures_c == {"device": 43.0}
+    assert told.link["packets_missing"] == 0
     camera.close()
 
 
