@@ -21,8 +21,10 @@ from measure.cli_check import check
 from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
 from measure.cli_export import export
+from measure.cli_gauge import gauge
 from measure.cli_history import activate, diff, history, rollback
 from measure.cli_import import import_session
+from measure.cli_inspect import inspect
 from measure.cli_jobs import jobs
 from measure.cli_measure import stitch, verify
 from measure.cli_plan import plan
@@ -66,6 +68,7 @@ VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("rollback", rollback, "Go back to the calibration that was used before."),
     ("diff", diff, "Compare two calibrations over the work volume."),
     ("stitch", stitch, "Put a session's scans into one cloud in the base."),
+    ("inspect", inspect, "Compare a cloud with its nominal: tolerances, verdict."),
     ("report", report, "Write report.html: the calibration and its proof."),
     ("show", show, "Write a Rerun recording of sessions, before and after."),
     ("study", study, "Run the paper's simulation: its tables and figures."),
@@ -77,6 +80,7 @@ VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
 """Name, function, and what the list of commands says of it: whole where longer helps would be cut off."""
 
 app.add_typer(new, name="new")
+app.add_typer(gauge, name="gauge", short_help="Studies of repeats, R&R, approach, drift.")
 app.add_typer(jobs, name="jobs", short_help="Measure parts unattended, one job a part.")
 for name, verb, summary in VERBS:
     app.command(name, short_help=summary)(verb)
