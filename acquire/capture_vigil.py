@@ -1,4 +1,4 @@
-"""What suspends a run although every device does as it is told: a sphere that is gone, a camera that drifts in temperature."""
+"""What suspends a run although every device does as it is told: a sphere that is gone, a camera that drifts in temperature, a full disk."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from acquire.capture_settings import CaptureSettings
 from acquire.events import Cause
 from acquire.plan import PlannedPose
-from drivers.errors import CameraError, DataError, SafetyStop, SpherecalError
+from drivers.errors import CameraError, DataError, FileError, SafetyStop, SpherecalError
 
 
 class SphereMissing(DataError):
@@ -19,7 +19,7 @@ class TemperatureDrift(DataError):
     """The camera's temperature has left that of the run's first shot."""
 
 
-SUSPENDING = (CameraError, SphereMissing, TemperatureDrift)
+SUSPENDING = (CameraError, SphereMissing, TemperatureDrift, FileError)
 """Beside RobotError: what a person at the cell may put right while the run waits."""
 
 
@@ -34,6 +34,8 @@ def cause_of(error: SpherecalError) -> Cause:
             return Cause.SPHERE
         case TemperatureDrift():
             return Cause.TEMPERATURE
+        case FileError():
+            return Cause.DISK
         case _:
             return Cause.ROBOT
 

@@ -155,6 +155,8 @@ class Cause(StrEnum):
     """One sphere was not found several times in a row: did somebody take or touch it?"""
     TEMPERATURE = "temperature"
     """The camera is not as warm as it was at the first shot of the run."""
+    DISK = "disk"
+    """The shot in hand cannot be written: the disk is full, or a share is gone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

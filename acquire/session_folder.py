@@ -20,14 +20,18 @@ from drivers.files.yaml import parse_yaml
 
 
 def check_free(target: Path) -> None:
-    """Refuse a folder that is in use.
+    """Refuse a folder that is in use, or that nothing can be written to.
 
     Raises:
-        FileError: it is not empty, or no folder.
+        FileError: it is not empty, no folder, or it cannot be made or written.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         remedy = "Choose another folder, or continue the run in it with `spherecal capture --resume`."
         raise FileError("is there already and not an empty folder", file=target, remedy=remedy)
+    there = next(folder for folder in (target.absolute(), *target.absolute().parents) if folder.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        remedy = "Choose another folder, or check permissions and disk."
+        raise FileError(f"cannot be made ({there} is no folder that can be written)", file=target, remedy=remedy)
 
 
 def make_folder(target: Path, files: Mapping[str, bytes]) -> None:

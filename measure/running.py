@@ -20,7 +20,7 @@ from acquire.events import Command, Event, Finished, Moved
 from acquire.identity import identity_of_new_session
 from acquire.plan import Plan, plan_text
 from acquire.session import SessionWriter
-from acquire.session_folder import check_free
+from acquire.session_folder import check_free, check_same_cell
 from drivers.protocols import Devices
 from measure.running_record import RunRecord, append_run, motion_digest, now_utc, runs_path
 
@@ -76,8 +76,10 @@ def capture_session(
         KeyboardInterrupt: somebody or something wants the run to end now; the robot is stopped.
     """
     devices, how = devices_of(cell), settings or settings_of(cell)
-    if not resume:
-        check_free(out)  # before a robot is even connected
+    if resume:  # before a robot is even connected
+        check_same_cell(out, cell)
+    else:
+        check_free(out)
     with devices, _session(cell, plan, out, devices.identity, resume) as writer, _recorded(cell, plan, out, how, stepped) as diary:
 
         def watch(event: Event) -> Command | None:

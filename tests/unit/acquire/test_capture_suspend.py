@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from acquire.capture_states import RunState
 from acquire.capture_vigil import SphereMissing, TemperatureDrift
 from acquire.events import (
     Append,
+    Captured,
     Cause,
     Command,
     Continue,
@@ -43,7 +45,7 @@ from drivers.errors import (
     SafetyStop,
     SpherecalError,
 )
-from drivers.files.session import read_session
+from drivers.files.session import read_scan, read_session
 from drivers.protocols import CameraInfo, Safety
 from tests.support.capture_bench import Answer, Bench, kinds, once, pose_ids
 from tests.support.fake_devices import FakeRobot, fake_plan
@@ -164,6 +166,37 @@ def test_another_camera_than_the_one_that_was_lost_is_not_gone_on_with(bench: Be
     assert pose_ids(events) == ["p0", "p1", "p2"]
     shots = read_session(bench.folder).shots
     assert [shot.pose_id for shot in shots] == ["p0", "p1", "p2"]
+
+
+@pytest.mark.parametrize("allowed", [0, 1, 2])
+def test_a_full_disk_suspends_and_the_shot_in_hand_is_taken_again(bench: Bench, allowed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is left of the shot that found no room, however far it came: its scan, the folder's entry, its line."""
+    fsync, left = os.fsync, [100, allowed, 0]
+
+    def full(descriptor: int) -> None:
+        left[0] -= 1
+        if left[0] < 0 and left[1] == 0 and left[2] == 0:
+            raise OSError(28, "No space left on device")
+        left[1] -= left[0] < 0 < left[1]
+        fsync(descriptor)
+
+    monkeypatch.setattr("os.fsync", full)
+
+    def answer(event: Event) -> Command | None:
+        if isinstance(event, Captured) and event.pose_id == "p0":
+            left[0] = 0
+        if isinstance(event, Suspended):
+            left[2] = 1  # somebody makes room
+            return Continue()
+        return None
+
+    events = bench.run(fake_plan(3), answer)
+    assert [(event.cause, event.pose_id) for event in suspended(events)] == [(Cause.DISK, "p1")]
+    assert pose_ids(events) == ["p0", "p1", "p2"]
+    session = read_session(bench.folder)
+    assert [shot.pose_id for shot in session.shots] == ["p0", "p1", "p2"]
+    for shot in session.shots:
+        read_scan(session, shot)
 
 
 def test_what_the_camera_tells_of_its_link_is_kept_with_the_shot(bench: Bench) -> None:

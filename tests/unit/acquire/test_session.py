@@ -16,6 +16,7 @@ import pytest
 
 from acquire.cell import Cell, load_cell
 from acquire.session import SessionWriter
+from acquire.session_folder import check_free
 from drivers.errors import FileError, SettingsError
 from drivers.files.session import read_scan, read_session
 from drivers.models import load_robot_model
@@ -300,3 +301,13 @@ def test_kill_9_many_times(tmp_path: Path, cell: Cell) -> None:
     seed = int.from_bytes(os.urandom(4))
     print("seed", seed)
     _kill_many(tmp_path / "s", cell, 100, seed)
+
+
+def test_a_place_that_cannot_be_written_is_told_before_anything_begins(tmp_path: Path, cell: Cell) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    for folder in (tmp_path / "file" / "s", Path("/proc/spherecal/s")):  # /proc takes nothing, from root neither
+        with pytest.raises(FileError, match="cannot be made") as caught:
+            SessionWriter.create(folder, purpose="calibration", cell=cell)
+        assert caught.value.remedy
+        assert not folder.exists()
+    check_free(tmp_path / "new" / "s")
