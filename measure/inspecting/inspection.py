@@ -1,0 +1,331 @@
+"""The inspection itself: cloud, nominal and spec in, verdict out; the deviation map after it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.errors import DataError
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
+from measure.decision import Verdict, judge
+from measure.inspecting.alignment import BestFit, best_fit, datum_alignment
+from measure.inspecting.cloud import MeasuredCloud
+from measure.inspecting.distance import NominalSurface
+from measure.inspecting.features import PartCloud, fit_feature, shape_of
+from measure.inspecting.fitting import Fit, Response
+from measure.inspecting.form import Form, form_of, with_form
+from measure.inspecting.geometry import element_of, nominal_element
+from measure.inspecting.nominal import Nominal
+from measure.inspecting.quantities import Measured, Model, own_quantities, quantity_of_check, require_checks_fit
+from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, FeatureResult, Inspection, Value
+from measure.inspecting.spec import InspectionSpec, PairCheck, ProfileCheck, SizeCheck, ZoneCheck
+from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance
+
+FieldSource = Callable[[Sequence[Response], FloatArray], FieldError]
+"""Makes the field of errors for some responses and part_from_base (4, 4)."""
+
+_DATUM_ROUNDS = 3
+_WIDER = 3.0
+_FEWEST_OF_PART = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Aligned:
+    """The cloud in the frame of the nominal."""
+
+    cloud: PartCloud
+    part_from_base: FloatArray
+    fitted: BestFit | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judging:
+    """What checks are judged with."""
+
+    model: Model
+    covariance: JointCovariance
+    forms: Mapping[str, tuple[float, float]]
+    """Form and its standard uncertainty, mm."""
+    problems: Mapping[str, str]
+    """Features that could not be measured, and why."""
+    deviations: DeviationMap | None
+    point_sigma_mm: float
+
+
+def inspect_cloud(
+    cloud: MeasuredCloud, nominal: Nominal, spec: InspectionSpec, *, field_source: FieldSource | None = None, with_map: bool = True
+) -> Inspection:
+    """Align, fit, judge; then map the deviations.
+
+    Args:
+        cloud: measured points, base frame.
+        nominal: mesh of the part.
+        spec: features, alignment, tolerances.
+        field_source: what is known of the cloud's common errors; from the cloud or the spec where None.
+        with_map: whether deviations are wanted though no check asks for them.
+
+    Raises:
+        DataError: nothing of the cloud lies on the part, or it cannot be aligned.
+        FileError: a check asks for what its feature does not have.
+        SettingsError: the datums fix no frame.
+    """
+    began = time.perf_counter()
+    require_likely_units(cloud, nominal)
+    require_checks_fit(spec, {name: shape_of(feature) for name, feature in spec.features.items()})
+    profile = any(isinstance(check, ProfileCheck) for check in spec.checks)
+    surface = NominalSurface.of(nominal) if profile or spec.alignment.method == "best_fit" else None
+    aligned = _align(cloud, spec, surface)
+    fits, problems = _fit_all(spec, aligned.cloud)
+    model = Model(spec.features, fits, _datums(spec), has_pose=aligned.fitted is not None)
+    forms = {name: form_of(fit) for name, fit in fits.items()}
+    responses = [*(with_form(fit.response, forms[name]) for name, fit in fits.items()), *([aligned.fitted.response] if aligned.fitted else [])]
+    field = _field(cloud, spec, field_source, responses, aligned.part_from_base)
+    covariance, sigmas = _covariances(responses, fits, forms, aligned.fitted, field, spec)
+    deviations = _deviations(cloud, surface, aligned, model, spec) if surface is not None and profile else None
+    judged = {name: (form.form_mm, sigmas[name]) for name, form in forms.items()}
+    judging = _Judging(model, covariance, judged, problems, deviations, field.point_sigma_mm())
+    features = tuple(_feature_result(name, judging) for name in spec.features)
+    checks = tuple(_check_result(number, spec, judging) for number in range(len(spec.checks)))
+    verdict, reasons = _verdict(checks, spec, field, problems)
+    seconds = time.perf_counter() - began
+    if deviations is None and with_map:
+        deviations = _deviations(cloud, surface or NominalSurface.of(nominal), aligned, model, spec)
+    return Inspection(
+        name=spec.name,
+        verdict=verdict,
+        reasons=reasons,
+        alignment=_alignment_result(spec, aligned, model, covariance),
+        features=features,
+        checks=checks,
+        n_points=len(cloud.points_mm),
+        calibration_id=cloud.calibration_id,
+        field_words=field.words,
+        inputs={"cloud": cloud.file, "nominal": nominal.file, "nominal_sha256": nominal.sha256, "session": cloud.session_digest},
+        notes=(*cloud.notes, *nominal.notes),
+        seconds_to_verdict=seconds,
+        deviations=deviations,
+        feature_points_in_part_mm={name: aligned.cloud.points_mm[fit.rows] for name, fit in fits.items()},
+    )
+
+
+def require_likely_units(cloud: MeasuredCloud, nominal: Nominal) -> None:
+    """Refuse a cloud and a nominal whose sizes differ as units do.
+
+    Raises:
+        DataError: factor 1000 or 25.4 between them.
+    """
+    low, high = np.quantile(cloud.points_mm, [0.005, 0.995], axis=0)
+    sizes, drawn = np.sort(high - low), np.sort(np.ptp(nominal.box_mm, axis=0))
+    ratio = float(sizes[-1] / max(drawn[-1], 1e-9))
+    if ratio < 1 / 200:
+        raise DataError(
+            f"the cloud is {sizes[-1]:.3g} long, the nominal {drawn[-1]:.3g}: the cloud is probably in metres",
+            file=cloud.file,
+            remedy="Clouds and nominals are in mm.",
+        )
+    if ratio > 200:
+        raise DataError(
+            f"the cloud is {sizes[-1]:.3g} mm long, the nominal {drawn[-1]:.3g}: the nominal is probably in metres",
+            file=nominal.file,
+            remedy="Export it in mm.",
+        )
+    for factor, words in ((25.4, "the nominal is probably in inches"), (1 / 25.4, "the cloud is probably in inches")):
+        if np.allclose(sizes / np.maximum(drawn, 1e-9), factor, rtol=0.03):
+            raise DataError(f"the cloud is {ratio:.3g} times as large as the nominal in every direction: {words}", file=cloud.file, remedy="Use mm.")
+
+
+def _align(cloud: MeasuredCloud, spec: InspectionSpec, surface: NominalSurface | None) -> _Aligned:
+    base_from_part = np.eye(4) if spec.alignment.base_from_part is None else np.asarray(spec.alignment.base_from_part)
+    part_from_base = se3.inverse(base_from_part)
+    placed = PartCloud(cloud.points_mm, cloud.normals, cloud.weights, cloud.voxel_mm or 0.0).moved(part_from_base)
+    if spec.alignment.method == "best_fit" and surface is not None:
+        fitted = best_fit(surface, placed)
+        return _Aligned(placed.moved(fitted.new_from_part), fitted.new_from_part @ part_from_base, fitted)
+    if spec.alignment.method == "datums":
+        for number in range(_DATUM_ROUNDS):
+            moved = _datum_step(spec, placed, _WIDER if number == 0 else 1.0)
+            placed, part_from_base = placed.moved(moved), moved @ part_from_base
+    return _Aligned(placed, part_from_base)
+
+
+def _datums(spec: InspectionSpec) -> tuple[str, ...]:
+    named = (spec.alignment.primary, spec.alignment.secondary, spec.alignment.tertiary)
+    return tuple(name for name in named if name is not None)
+
+
+def _datum_step(spec: InspectionSpec, cloud: PartCloud, wider: float) -> FloatArray:
+    names = _datums(spec)
+    measured, drawn = {}, {}
+    for name in names:
+        feature = spec.features[name]
+        searched = feature.model_copy(update={"search_mm": feature.search_mm * wider})
+        fit = fit_feature(name, searched, cloud, spec.features)
+        measured[name] = element_of(feature, fit.shape, fit.params)
+        drawn[name] = nominal_element(feature, fit.shape)
+    return datum_alignment(names, measured, drawn)
+
+
+def _fit_all(spec: InspectionSpec, cloud: PartCloud) -> tuple[dict[str, Fit], dict[str, str]]:
+    fits: dict[str, Fit] = {}
+    problems: dict[str, str] = {}
+    for name, feature in spec.features.items():
+        try:
+            fit = fit_feature(name, feature, cloud, spec.features)
+            # the camera sees the surface farther out by the known offset than it is
+            fits[name] = replace(fit, params=fit.params - fit.response.outward * spec.surface.offset_mm)
+        except DataError as error:
+            if name in _datums(spec):
+                raise
+            problems[name] = f"{error.message}. {error.remedy or ''}".strip()
+    return fits, problems
+
+
+def _field(
+    cloud: MeasuredCloud, spec: InspectionSpec, source: FieldSource | None, responses: Sequence[Response], part_from_base: FloatArray
+) -> FieldError:
+    if not responses:
+        return UnknownField()
+    if source is not None:
+        return source(responses, part_from_base)
+    if cloud.standard_uncertainty_mm is not None:
+        words = f"the cloud's own uncertainty, {cloud.standard_uncertainty_mm:.3f} mm (k = 1) at a typical point, taken as shared by whole regions"
+        return StatedField(cloud.standard_uncertainty_mm, words)
+    if spec.point_expanded_uncertainty_mm is not None:
+        words = f"point_expanded_uncertainty_mm {spec.point_expanded_uncertainty_mm:g} of the inspection file"
+        return StatedField(spec.point_expanded_uncertainty_mm / 2, words)
+    return UnknownField()
+
+
+def _covariances(
+    responses: Sequence[Response], fits: Mapping[str, Fit], forms: Mapping[str, Form], fitted: BestFit | None, field: FieldError, spec: InspectionSpec
+) -> tuple[JointCovariance, dict[str, float]]:
+    """Of all parameters together, and the standard uncertainty of every form, which stand behind each other in the responses."""
+    from scipy.linalg import block_diag
+
+    if not responses:
+        return JointCovariance(np.zeros((0, 0)), (np.zeros((0, 0)),), np.zeros(0)), {}
+    blocks = [block_diag(fit.covariance, np.array([[forms[name].noise_variance_mm2]])) for name, fit in fits.items()]
+    blocks += [fitted.covariance] if fitted else []
+    everything = joint_covariance(responses, blocks, field, spec.surface.expanded_uncertainty_mm / 2)
+    at_form = np.cumsum([len(fit.params) + 1 for fit in fits.values()]) - 1
+    rows = np.eye(len(everything.by_surface))
+    sigmas = {name: float(np.sqrt(everything.of(rows[[at]])[0, 0])) for name, at in zip(forms, at_form, strict=True)}
+    return everything.of_rows(np.delete(np.arange(len(rows)), at_form)), sigmas
+
+
+def _feature_result(name: str, judging: _Judging) -> FeatureResult:
+    feature = judging.model.features[name]
+    if name in judging.problems:
+        return FeatureResult(name, feature.kind, judging.problems[name])
+    fit = judging.model.fits[name]
+    drawn = judging.model.nominal([name])
+    values = []
+    for quantity in own_quantities(name, drawn[name]):
+        found = judging.model.measure(quantity, judging.covariance)
+        values.append(Value(quantity.name, quantity.unit, quantity.value(drawn), found.value, 2 * found.standard_uncertainty))
+    form_mm, sigma_mm = judging.forms[name]
+    return FeatureResult(name, feature.kind, None, len(fit.rows), fit.n_rejected, fit.rms_mm, form_mm, 2 * sigma_mm, tuple(values))
+
+
+def _check_result(number: int, spec: InspectionSpec, judging: _Judging) -> CheckResult:
+    check = spec.checks[number]
+    features = _features_of(check)
+    shapes = {name: shape_of(spec.features[name]) for name in features}
+    drawn = {name: nominal_element(spec.features[name], shape) for name, shape in shapes.items()}
+    name = check.name or " ".join([check.kind.replace("_", " "), *(f"{a}" for a in ([" - ".join(features)] if features else []))])
+    unit, nominal = "mm", 0.0
+    quantity = None
+    if isinstance(check, SizeCheck | PairCheck) or (isinstance(check, ZoneCheck) and check.kind == "position"):
+        quantity = quantity_of_check(check, drawn)
+        unit = quantity.unit
+    if quantity is not None and isinstance(check, SizeCheck | PairCheck):
+        nominal = quantity.value(drawn) if check.nominal is None else check.nominal
+    lower, upper = _limits(check, nominal)
+    result = CheckResult(name, check.kind, features, unit, nominal, lower, upper, None, float("nan"), "not_proven")
+    missing = [feature for feature in features if feature in judging.problems]
+    if missing:
+        return replace(result, problem=f"{missing[0]}: {judging.problems[missing[0]]}")
+    if quantity is not None:
+        found = judging.model.measure(quantity, judging.covariance)
+    elif isinstance(check, ProfileCheck):
+        found = _profile(check, judging)
+    else:
+        found = Measured(*judging.forms[features[0]])
+    return _judged(result, found)
+
+
+def _features_of(check: SizeCheck | ZoneCheck | PairCheck | ProfileCheck) -> tuple[str, ...]:
+    if isinstance(check, PairCheck):
+        return check.between
+    return () if isinstance(check, ProfileCheck) else (check.feature,)
+
+
+def _limits(check: SizeCheck | ZoneCheck | PairCheck | ProfileCheck, nominal: float) -> tuple[float, float]:
+    if isinstance(check, ZoneCheck | ProfileCheck):
+        return 0.0, check.tolerance or 0.0
+    if check.tolerance is not None:
+        return nominal - check.tolerance, nominal + check.tolerance
+    return nominal + (check.lower or 0.0), nominal + (check.upper or 0.0)
+
+
+def _profile(check: ProfileCheck, judging: _Judging) -> Measured:
+    deviations = judging.deviations
+    if deviations is None:  # made before whenever a check asks for it
+        raise ValueError(check.kind)
+    return Measured(float(np.quantile(np.abs(deviations.signed_mm), check.quantile)), judging.point_sigma_mm)
+
+
+def _judged(result: CheckResult, found: Measured) -> CheckResult:
+    zone = result.lower == 0.0 and result.kind in {"flatness", "form", "position", "profile"}
+    middle = 0.0 if zone else (result.lower + result.upper) / 2
+    half = result.upper if zone else (result.upper - result.lower) / 2
+    verdict = judge(result.name, found.value - middle, half, found.standard_uncertainty).verdict
+    return replace(result, measured=found.value, expanded_uncertainty=2 * found.standard_uncertainty, verdict=verdict)
+
+
+def _verdict(checks: Sequence[CheckResult], spec: InspectionSpec, field: FieldError, problems: Mapping[str, str]) -> tuple[Verdict, tuple[str, ...]]:
+    """As `measure.decision.overall`, on checks with units of their own."""
+    gaps = [] if checks else ["no tolerances given"]
+    gaps += [f"{name} could not be measured: {text}" for name, text in problems.items() if not any(name in check.features for check in checks)]
+    if isinstance(field, UnknownField) and checks:
+        gaps.append(f"{field.words}: name the calibration and the session, or state point_expanded_uncertainty_mm")
+    reasons = [check.reason for check in checks if check.verdict != "conform"]
+    if any(check.verdict == "reject" for check in checks):
+        return "reject", (*reasons, *gaps)
+    if reasons or gaps:
+        return "not_proven", (*reasons, *gaps)
+    tightest = max(checks, key=lambda check: check.share)
+    return "conform", (f"all {len(checks)} tolerances of {spec.name} are kept; the tightest is {tightest.reason}",)
+
+
+def _deviations(cloud: MeasuredCloud, surface: NominalSurface, aligned: _Aligned, model: Model, spec: InspectionSpec) -> DeviationMap:
+    points = se3.apply(model.alignment(), aligned.cloud.points_mm)
+    near = surface.nearest(points)
+    signed = near.signed_mm - spec.surface.offset_mm
+    kept = (np.abs(signed) <= spec.deviation_limit_mm) & ~near.at_border
+    if kept.sum() < _FEWEST_OF_PART:
+        raise DataError(
+            f"{int(kept.sum())} of {len(points)} points lie within {spec.deviation_limit_mm:g} mm of the nominal",
+            file=cloud.file,
+            remedy="Give alignment.base_from_part, or align by best_fit or datums; see that cloud and nominal are of one part, in mm.",
+        )
+    normal = near.normal[kept].mean(axis=0)
+    length = float(np.linalg.norm(normal))
+    facing = normal / length if length > 0.05 else np.array([0.0, 0.0, 1.0])  # seen from all sides
+    return DeviationMap(points[kept], cloud.points_mm[kept], signed[kept], int((~kept).sum()), spec.deviation_limit_mm, facing)
+
+
+def _alignment_result(spec: InspectionSpec, aligned: _Aligned, model: Model, covariance: JointCovariance) -> AlignmentResult:
+    part_from_base = model.alignment() @ aligned.part_from_base
+    if aligned.fitted is None:
+        return AlignmentResult(spec.alignment.method, part_from_base)
+    middle = aligned.cloud.points_mm.mean(axis=0)
+    gradient = np.zeros((6, len(model.params)))
+    gradient[:, -6:] = np.eye(6)
+    gradient[:3, -3:] = -se3.hat(middle)
+    sigma = np.sqrt(np.maximum(np.diag(covariance.of(gradient)), 0.0))
+    return AlignmentResult("best_fit", part_from_base, aligned.fitted.rms_mm, 2 * sigma[:3], 2 * sigma[3:])
