@@ -22,7 +22,7 @@ from calibrate import normal
 from calibrate.assemble import subset
 from calibrate.clouds import Solution, thinned
 from calibrate.normal import NoiseModel
-from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry
+from calibrate.problem import Geometry, Problem, State, expected_radius_mm, linearise_geometry, without_terms
 from calibrate.sums import ShotSums, shot_sums
 from calibrate.validation import Prediction, cross_validate
 from calibrate.variance import estimate_incidence, estimate_point_noise, estimate_pose_noise, estimate_range_growth
@@ -30,7 +30,7 @@ from drivers.errors import DataError, SettingsError
 from drivers.kinematics.se3 import FloatArray
 
 _FIT_TOLERANCE_MM = 1e-9
-_NOISE_TOLERANCE = 1e-3
+_NOISE_TOLERANCE = 1e-6
 _LOOSE = 1e-6
 _LEAST_SHARE, _LEVER_MM = 1e-3, 500.0
 _MAX_FIT_PASSES = 25
@@ -40,9 +40,12 @@ _ROUND_TOLERANCE_MM = 1e-7
 """Of a round, of which the next moves a tenth or less."""
 _MAX_STEPS = 30
 _MAX_ROUNDS = 25
-_MOST_ESTIMATES, _LATER_ESTIMATES = 4, 2
+_MOST_ESTIMATES, _LATER_ESTIMATES = 6, 3
 """Rounds in which the noise model may be estimated anew; later ones hold it, so that the descent can end."""
-_IN_PLACE_MM, _FIRST_SWEEPS = 0.05, 4
+_SWEEPS = (2, 1, 1, 0)
+"""Of the search for the pose noise, round by round: what it ends in must not depend on where the solve began, and the Newton
+steps of the last ones cost twice what a sweep does."""
+_IN_PLACE_MM = 0.05
 _AHEAD_POINTS = 500
 """Points a shot on which shots of many points are solved first."""
 
@@ -156,13 +159,26 @@ def solve_centres(problem: Problem, start: State, noise: NoiseModel) -> Solution
         DataError: the rounds do not settle, which means that data and model do not belong together.
     """
     require_centres(problem)
+    rigid, begin = (problem, start) if problem.free_terms.any() else (without_terms(problem), replace(start, terms_rad=start.terms_rad[:0]))
     if len(problem.points_in_camera_mm) <= 2 * _AHEAD_POINTS * problem.n_shots:
-        return _rounds(problem, start, noise, ahead=False)
-    ahead = _rounds(thinned(problem, _AHEAD_POINTS), start, noise, ahead=False)
-    return _rounds(problem, ahead.state, ahead.noise, ahead=True)
+        found, fits = _rounds(rigid, begin, noise, ahead=False)
+    else:
+        ahead, _ = _rounds(thinned(rigid, _AHEAD_POINTS), begin, noise, ahead=False)
+        found, fits = _rounds(rigid, ahead.state, ahead.noise, ahead=True)
+    return found if rigid is problem else _with_held_terms(found, fits, problem)
 
 
-def _rounds(problem: Problem, state: State, noise: NoiseModel, *, ahead: bool) -> Solution:
+def _with_held_terms(found: Solution, fits: CentreFits, problem: Problem) -> Solution:
+    """A solution without terms as one that knows them: they stand at zero, and only the covariance tells of them."""
+    state = replace(found.state, terms_rad=np.zeros(len(problem.terms)))
+    geometry = linearise_geometry(problem, state)
+    moments = fits.moments(problem, state, geometry)
+    linearised = normal.linearise(problem, state, geometry, moments, fits.weight(found.noise))
+    reduced = normal.reduce(linearised, found.noise.pose_precision)
+    return Solution(problem, state, found.noise, linearised, reduced, geometry, moments, found.point_rms_mm, found.passes)
+
+
+def _rounds(problem: Problem, state: State, noise: NoiseModel, *, ahead: bool) -> tuple[Solution, CentreFits]:
     """Fit and solve in turns until neither moves a centre; `ahead` where state and noise are good already."""
     geometry = linearise_geometry(problem, state)
     known, n_estimates = (noise, _LATER_ESTIMATES) if ahead else (None, _MOST_ESTIMATES)
@@ -173,13 +189,13 @@ def _rounds(problem: Problem, state: State, noise: NoiseModel, *, ahead: bool) -
         before, expected = noise, geometry.centre_in_camera_mm
         if estimating:
             noise = _point_noise(sums, noise, first=known is None)
-        sweeps = (_FIRST_SWEEPS if known is None else 1) if estimating else 0
+        sweeps = _SWEEPS[min(passes, len(_SWEEPS)) - 1 if not ahead else -1] if estimating else None
         solution = _solve_on(fits, problem, state, noise, sweeps=sweeps, in_place=known is not None)
         state, noise = solution.state, solution.noise
         geometry, known = replace(solution.geometry, centre_in_camera_mm=fits.centres_at(problem, state)), noise
         moved_mm = float(np.abs(geometry.centre_in_camera_mm - expected).max())
         if not estimating and moved_mm < _ROUND_TOLERANCE_MM:
-            return replace(solution, passes=passes)
+            return replace(solution, passes=passes), fits
         if passes > 1 and _settled(before, noise):
             n_estimates = passes
     raise DataError(
@@ -193,11 +209,16 @@ def cross_validate_centres(solution: Solution) -> Prediction:
     problem, noise = solution.problem, solution.noise
     fits = fits_of_solution(solution)
     blind = replace(problem, points_in_camera_mm=problem.points_in_camera_mm[:0], starts=np.zeros_like(problem.starts))
+    terms_rad = solution.state.terms_rad
+    held = not problem.free_terms.any()
+    blind = without_terms(blind) if held else blind
 
     def without(keep: NDArray[np.int64]) -> State:
         training = subset(blind, keep)
-        start = replace(solution.state, pose_noise=solution.state.pose_noise[np.unique(problem.scan[keep])])
-        return _solve_on(fits.subset(keep), training, start, noise).state
+        pose_noise = solution.state.pose_noise[np.unique(problem.scan[keep])]
+        start = replace(solution.state, pose_noise=pose_noise, terms_rad=terms_rad[:0] if held else terms_rad)
+        found = _solve_on(fits.subset(keep), training, start, noise).state
+        return replace(found, terms_rad=terms_rad) if held else found
 
     return cross_validate(solution, solve=without)
 
@@ -231,10 +252,10 @@ def _solve_on(
     state: State,
     noise: NoiseModel,
     *,
-    sweeps: int = 0,
+    sweeps: int | None = None,
     in_place: bool = True,
 ) -> Solution:
-    """Gauss-Newton on centres alone; with sweeps of the pose noise the last digits are left to a later round.
+    """Gauss-Newton on centres alone; while sweeps estimate the pose noise (0: Newton steps) the last digits are left to a later round.
 
     The pose noise is not estimated before the state is in place: until then all that the start is off would be noise.
     """
@@ -243,13 +264,13 @@ def _solve_on(
         geometry = linearise_geometry(problem, state)
         moments = fits.moments(problem, state, geometry)
         linearised = normal.linearise(problem, state, geometry, moments, weight)
-        if sweeps and in_place:
+        if sweeps is not None and in_place:
             noise = estimate_pose_noise(linearised, noise, sweeps=sweeps)
         reduced = normal.reduce(linearised, noise.pose_precision)
         step, noise_step = normal.solve_step(linearised, reduced)
         state = state.moved(problem.layout, step, noise_step)
         step_mm = float(np.abs(geometry.columns[:, :3] @ step).max())
-        if (sweeps and in_place) or step_mm < _STEP_TOLERANCE_MM:
+        if (sweeps is not None and in_place) or step_mm < _STEP_TOLERANCE_MM:
             break
         in_place = step_mm < _IN_PLACE_MM
     return Solution(problem, state, noise, linearised, reduced, geometry, moments, fits.point_rms_mm, 0)

@@ -123,6 +123,20 @@ def linearise(problem: Problem, state: State, geometry: Geometry, moments: Float
     )
 
 
+def held_poses(problem: Problem, state: State, jacobian: FloatArray, miss_mm: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Hessian (P, P) and gradient (P,) of centres that miss by (m, 3), all directions known alike, where poses have no noise.
+
+    `jacobian` (m, 3, P) is that of the misses, `weight` (m,) in mm^-2; the problem's priors and lengths are added.
+    """
+    root = np.sqrt(weight)
+    rows = (jacobian * root[:, None, None]).reshape(-1, jacobian.shape[-1])
+    length_hessian, length_gradient, _ = _lengths(problem, state)
+    prior_precision, prior_value = _priors(problem, state)
+    hessian = rows.T @ rows + length_hessian + np.diag(prior_precision)
+    gradient = rows.T @ (miss_mm * root[:, None]).reshape(-1) + length_gradient + prior_precision * prior_value
+    return hessian, gradient
+
+
 def reduce(linearised: Linearised, pose_precision: FloatArray, scan_weight: FloatArray | None = None) -> Reduced:
     """Eliminate the nuisances; `scan_weight` (G,) in [0, 1] weakens the prior of scans that look spoiled."""
     precision = np.broadcast_to(pose_precision, linearised.pose_noise.shape)
@@ -171,16 +185,41 @@ def symmetric_inverse(matrix: FloatArray, relative: float = 1e-13) -> FloatArray
     return np.asarray((kept / values[keep]) @ kept.T * scale[:, None] * scale)
 
 
+class MarginalCost:
+    """-2 log marginal likelihood of pose-noise models (REML: unknowns and nuisances integrated out), up to a constant."""
+
+    def __init__(self, linearised: Linearised) -> None:
+        """Of the sums of one linearisation; the gradient rides along with the columns of the unknowns."""
+        self._sums = linearised
+        self._rows = np.concatenate([linearised.cross, linearised.noise_gradient[..., None]], axis=-1)
+        # kept from call to call: fresh memory costs more than the sums
+        self._white = np.empty(self._rows.shape)
+        self._whole = np.block([[linearised.hessian, linearised.gradient[:, None]], [linearised.gradient[None], np.full((1, 1), linearised.cost)]])
+
+    def __call__(self, pose_precision: FloatArray) -> float:
+        """At inverse variances (6,) of a nuisance twist."""
+        from calibrate.normal_kernels import whiten
+
+        sums = self._sums
+        self._rows[:, :, -1] = sums.noise_gradient + pose_precision * sums.pose_noise
+        log_determinant = whiten(sums.noise_hessian, pose_precision, self._rows, self._white)
+        flat = self._white.reshape(-1, self._rows.shape[-1])
+        left = self._whole - flat.T @ flat
+        hessian, gradient = left[:-1, :-1], left[:-1, -1]
+        cost = left[-1, -1] + float((pose_precision * sums.pose_noise**2).sum())
+        diagonal = np.diagonal(hessian)
+        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        # the last term keeps directions that nothing determines out of the comparison: they add a constant
+        scaled = hessian * scale[:, None] * scale + _HELD_UP * np.eye(len(scale))
+        right = scale * gradient
+        log_det = float(np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum())
+        log_prior = len(sums.pose_noise) * float(np.log(pose_precision).sum())
+        return log_determinant - log_prior + log_det + cost - float(right @ np.linalg.solve(scaled, right))
+
+
 def marginal_cost(linearised: Linearised, pose_precision: FloatArray) -> float:
-    """-2 log marginal likelihood of the pose-noise model (REML: unknowns and nuisances integrated out), up to a constant."""
-    reduced = reduce(linearised, pose_precision)
-    diagonal = np.diagonal(reduced.hessian)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    # the last term keeps directions that nothing determines out of the comparison: they add a constant
-    scaled = reduced.hessian * scale[:, None] * scale + _HELD_UP * np.eye(len(scale))
-    right = scale * reduced.gradient
-    log_det = float(np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum())
-    return reduced.log_determinant + log_det + reduced.cost - float(right @ np.linalg.solve(scaled, right))
+    """One value of `MarginalCost`."""
+    return MarginalCost(linearised)(pose_precision)
 
 
 def _sum_by_scan(per_shot: FloatArray, scan: NDArray[np.int64], n_scans: int) -> FloatArray:

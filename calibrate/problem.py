@@ -12,14 +12,13 @@ targets (3 T). The pose noise is a nuisance twist per scan,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.camera_error import CameraError
-from calibrate.datum import link_columns, term_columns, twist_columns
 from calibrate.external_points import ExternalPoints
 from calibrate.robot_terms import RobotTerm
 from drivers.kinematics import mdh, se3
@@ -250,19 +249,30 @@ class Geometry:
         return Geometry(*(getattr(self, each.name)[keep] for each in fields(self)))
 
 
-def corrected_chain(problem: Problem, state: State) -> FloatArray:
-    """`base_from_link_i` (m, n + 1, 4, 4) of every shot; a chain of one frame for pose-only data."""
+def without_terms(problem: Problem) -> Problem:
+    """The problem of a rigid arm: where no term is estimated they are held at zero, and a solve without them ends at the same place."""
+    return replace(problem, terms=(), load=np.zeros((problem.n_shots, 0, 0)))
+
+
+def corrected_chain(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+    """Flange poses (m, 4, 4) and frames of the link twists (m, n, 4, 4), each before its own twist; n is 0 for pose-only data."""
+    from calibrate import geometry_kernels
+
     if problem.model is None or problem.joints_rad is None:
-        return problem.base_from_flange[:, None]
+        return problem.base_from_flange, np.zeros((problem.n_shots, 0, 4, 4))
     deflection = problem.load @ state.terms_rad if state.terms_rad.any() else None
-    return mdh.chain(problem.model, problem.joints_rad, state.link_twists, deflection)
+    links = mdh.link_transforms(problem.model, problem.joints_rad, deflection)
+    base_from_flange, turned = np.zeros((problem.n_shots, 4, 4)), np.zeros(links.shape)
+    geometry_kernels.chain_frames(links, se3.exp(state.link_twists), base_from_flange, turned)
+    return base_from_flange, turned
 
 
-def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None = None) -> Geometry:
+def linearise_geometry(problem: Problem, state: State) -> Geometry:
     """Camera poses, expected centres and Jacobian columns of all shots at a state."""
+    from calibrate import geometry_kernels
+
     layout = problem.layout
-    frames = corrected_chain(problem, state) if frames is None else frames
-    base_from_flange = frames[:, -1]
+    base_from_flange, turned = corrected_chain(problem, state)
     base_from_camera = base_from_flange @ state.flange_from_camera
     centre = state.centres_in_base_mm[problem.sphere]
     lever = centre - base_from_flange[:, :3, 3]
@@ -270,18 +280,19 @@ def linearise_geometry(problem: Problem, state: State, frames: FloatArray | None
     noise = np.einsum("mij,mj->mi", noise_columns, state.pose_noise[problem.scan])
     moving_point = centre - noise
     camera_from_base_rotation = np.swapaxes(base_from_camera[:, :3, :3], -1, -2)
-    motion = np.zeros((problem.n_shots, 3, layout.size))
-    if problem.model is not None and problem.joints_rad is not None:
-        motion[:, :, layout.links] = link_columns(state.link_twists, frames, moving_point)
-        if problem.terms:
-            motion[:, :, layout.terms] = term_columns(state.link_twists, frames, problem.load, moving_point)
-    motion[:, :, layout.hand_eye] = twist_columns(base_from_flange, moving_point)
     rows = np.arange(problem.n_shots)
-    first = layout.centres.start
-    for axis in range(3):
-        motion[rows, axis, first + 3 * problem.sphere + axis] -= 1.0
     columns = np.zeros((problem.n_shots, layout.n_camera + 4, layout.size))
-    columns[:, :3] = camera_from_base_rotation @ motion
+    geometry_kernels.motion_columns(
+        np.ascontiguousarray(camera_from_base_rotation),
+        np.ascontiguousarray(base_from_flange),
+        turned,
+        se3.left_jacobian(state.link_twists),
+        problem.load if problem.terms else np.zeros((problem.n_shots, 0, 0)),
+        moving_point,
+        problem.sphere,
+        np.array([layout.links.start, layout.hand_eye.start, layout.terms.start, layout.centres.start]),
+        columns,
+    )
     k = np.arange(layout.n_camera)
     columns[:, 3 + k, layout.camera.start + k] = 1.0
     columns[:, -1, layout.radius_offset.start] = 1.0

@@ -6,19 +6,19 @@ every unknown is refined on centres with a redescending weight per shot, which s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibrate import normal
-from calibrate.normal import NoiseModel
-from calibrate.problem import Problem, State, linearise_geometry
+from calibrate.problem import Problem, State, linearise_geometry, without_terms
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _ROUNDS = 30
-_STILL_MM = 1e-5
+_STILL_MM, _NEARLY_STILL = 1e-4, 0.02
+"""Change of a shot's miss from which on the start stands, and the part of the scale from which on everything is let free."""
 _SURELY_MM, _MANY_SHOTS = 0.3, 30
 _SMALLEST_SCALE_MM = 0.05
 _REJECT_SCALES = 8.0
@@ -51,15 +51,13 @@ def start_from_centres(problem: Problem, centres_in_camera_mm: FloatArray, guess
     Raises:
         DataError: neither brings most shots within some centimetres of one place: the data do not belong together.
     """
-    hand_eyes = [] if guess is None else [guess]
-    linear = _linear_hand_eye(problem, centres_in_camera_mm)
-    if linear is not None:
-        hand_eyes.append(linear)
-    if not hand_eyes:
+    best = None if guess is None else _refine(problem, centres_in_camera_mm, guess)
+    if best is None or not (best.scale_mm < _SURELY_MM and problem.n_shots >= _MANY_SHOTS):
+        linear = _linear_hand_eye(problem, centres_in_camera_mm)
+        starts = [best] if linear is None else [best, _refine(problem, centres_in_camera_mm, linear)]
+        best = min((start for start in starts if start is not None), key=lambda start: start.scale_mm, default=None)
+    if best is None:
         raise DataError("too few shots for a first guess of the hand-eye transform", remedy="Take at least 12 shots from different orientations.")
-    best = _refine(problem, centres_in_camera_mm, hand_eyes[0])
-    if len(hand_eyes) > 1 and not (best.scale_mm < _SURELY_MM and problem.n_shots >= _MANY_SHOTS):
-        best = min(best, _refine(problem, centres_in_camera_mm, hand_eyes[1]), key=lambda s: s.scale_mm)
     if not best.scale_mm < _FITS_MM:
         raise DataError(
             f"no hand-eye transform brings the shots of a sphere to one place (they stay {best.scale_mm:.0f} mm apart)",
@@ -117,34 +115,32 @@ def _linear_hand_eye(problem: Problem, centres: FloatArray) -> FloatArray | None
 
 def _refine(problem: Problem, centres: FloatArray, hand_eye: FloatArray) -> Start:
     """Gauss-Newton on centres, a weight per shot; first the hand-eye transform and centres, then everything."""
-    state = initial_state(problem, hand_eye, centres_by_median(problem, hand_eye, centres))
+    bare = without_terms(problem)
+    layout, camera_shift = bare.layout, _basis_at(bare, centres)
+    nothing = np.zeros_like(initial_state(bare, hand_eye, np.zeros((layout.n_spheres, 3))).pose_noise)
+    free = np.concatenate([np.arange(layout.size)[layout.hand_eye], np.arange(layout.size)[layout.centres]])
+    state = initial_state(bare, hand_eye, centres_by_median(bare, hand_eye, centres))
     scale, miss, everything = np.inf, np.full(problem.n_shots, np.inf), False
     for turn in range(_ROUNDS):
-        geometry = linearise_geometry(problem, state)
-        camera_shift = _basis_at(problem, centres)
-        corrected = centres + np.einsum("mki,k->mi", camera_shift, state.camera_mm)
-        difference = corrected - geometry.centre_in_camera_mm
+        geometry = linearise_geometry(bare, state)
+        difference = centres + np.einsum("mki,k->mi", camera_shift, state.camera_mm) - geometry.centre_in_camera_mm
         previous, miss = miss, np.linalg.norm(difference, axis=1)
-        still = bool(np.abs(miss - previous).max() < _STILL_MM)
-        if everything and still:
+        moved_mm = float(np.abs(miss - previous).max())
+        if everything and moved_mm < _STILL_MM:
             break
-        everything = everything or still or turn >= _ROUNDS // 3
+        everything = everything or moved_mm < _NEARLY_STILL * scale or turn >= _ROUNDS // 3
         # the median length of a 3-vector of unit noise is 1.54
         scale = max(float(np.median(miss)) / 1.54, _SMALLEST_SCALE_MM)
-        weight = _weights(miss, scale)
-        moments = _centre_moments(difference, camera_shift, weight)
-        linearised = normal.linearise(problem, state, geometry, moments, np.full(problem.n_shots, scale**-2.0))
-        held = NoiseModel(scale, 1e-6, 1e-9)
-        reduced = normal.reduce(linearised, held.pose_precision)
-        if not everything:
-            free = np.zeros(problem.layout.size, dtype=bool)
-            free[problem.layout.hand_eye] = free[problem.layout.centres] = True
-            step = np.zeros(problem.layout.size)
-            step[free] = -normal.symmetric_solve(reduced.hessian[np.ix_(free, free)], reduced.gradient[free])
+        jacobian = geometry.columns[:, :3]
+        jacobian[:, :, layout.camera] += np.swapaxes(camera_shift, 1, 2)
+        hessian, gradient = normal.held_poses(bare, state, jacobian, difference, _weights(miss, scale) / scale**2)
+        if everything:
+            step = -normal.symmetric_solve(hessian, gradient)
         else:
-            step = -normal.symmetric_solve(reduced.hessian, reduced.gradient)
-        state = state.moved(problem.layout, step, np.zeros_like(state.pose_noise))
-    return Start(state, miss, scale)
+            step = np.zeros(layout.size)
+            step[free] = -normal.symmetric_solve(hessian[np.ix_(free, free)], gradient[free])
+        state = state.moved(layout, step, nothing)
+    return Start(replace(state, terms_rad=np.zeros(len(problem.terms))), miss, scale)
 
 
 def _weights(miss_mm: FloatArray, scale_mm: float) -> FloatArray:
@@ -157,13 +153,3 @@ def _basis_at(problem: Problem, centres: FloatArray) -> FloatArray:
     result = np.zeros((*values.shape, 3))
     result[:, np.arange(values.shape[1]), problem.camera_error.axis] = values
     return result
-
-
-def _centre_moments(difference: FloatArray, camera_shift: FloatArray, weight: FloatArray) -> FloatArray:
-    """Moment matrices as of points that know their centre in all three directions and nothing of the radius."""
-    m, k = camera_shift.shape[:2]
-    rows = np.zeros((m, 3, k + 5))
-    rows[:, :, :3] = np.eye(3)
-    rows[:, :, 3 : 3 + k] = np.swapaxes(camera_shift, 1, 2)
-    rows[:, :, -1] = difference
-    return np.asarray(np.swapaxes(rows, 1, 2) @ rows * weight[:, None, None])

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.normal import PATCHES, Linearised, NoiseModel, marginal_cost
+from calibrate.normal import PATCHES, Linearised, MarginalCost, NoiseModel
 from drivers.kinematics.se3 import FloatArray
 
 _SMALLEST_MM, _SMALLEST_RAD = 1e-4, 2e-7
@@ -102,10 +102,11 @@ def estimate_pose_noise(linearised: Linearised, start: NoiseModel, *, sweeps: in
     """
     floor = np.log([_SMALLEST_MM, _SMALLEST_RAD])
     where = np.maximum(np.log([start.pose_mm, start.pose_rad]), floor)
+    marginal_cost = MarginalCost(linearised)
 
     def cost(log_sigma: FloatArray) -> float:
         sigma_mm, sigma_rad = np.exp(np.maximum(log_sigma, floor))
-        return marginal_cost(linearised, replace(start, pose_mm=float(sigma_mm), pose_rad=float(sigma_rad)).pose_precision)
+        return marginal_cost(replace(start, pose_mm=float(sigma_mm), pose_rad=float(sigma_rad)).pose_precision)
 
     where = minimise_by_parabolas(cost, where, floor, sweeps=sweeps)
     return replace(start, pose_mm=float(np.exp(where[0])), pose_rad=float(np.exp(where[1])))

@@ -118,6 +118,18 @@ def test_neither_order_nor_start_changes_the_end() -> None:
     np.testing.assert_allclose(se3.apply(se3.fit_rigid(ends[2], ends[0]), ends[2]), ends[0], atol=1e-6)
 
 
+def test_a_start_in_place_and_one_that_is_not_end_alike() -> None:
+    """From a start within hundredths of a mm the pose noise is estimated a step earlier: it must end in the same minimum."""
+    rng = np.random.default_rng(5)
+    problem = problem_of(CELL, draw_shots(CELL, rng, 40, n_points=100))
+    base = solve_centres(problem, start_of(problem, CELL, np.random.default_rng(1)), FIRST_NOISE)
+    turn = rng.normal(size=(6, 6)) * [1, 1, 1, 2e-3, 2e-3, 2e-3]
+    for size in (0.0, 0.003, 0.03, 0.3):
+        start = replace(base.state, link_twists=base.state.link_twists + size * turn, pose_noise=0.0 * base.state.pose_noise)
+        found = solve_centres(problem, start, FIRST_NOISE)
+        np.testing.assert_allclose(found.geometry.centre_in_camera_mm, base.geometry.centre_in_camera_mm, atol=1e-6)
+
+
 def test_held_out_centres_are_hardly_worse_than_those_of_whole_clouds() -> None:
     """What the shape of a cap tells of the camera is little beside sixty centres."""
     ratios = []
