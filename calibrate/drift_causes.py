@@ -3,7 +3,7 @@
 Each cause moves the residuals along a few columns with amplitudes of physical size. Its evidence is the marginal likelihood
 `N(y; 0, V + D P D')`, averaged over sizes and over the shapes that a cause may have: a cause that could have explained
 anything is believed less than one that predicts what was seen (penalised likelihood, Occam's share in the determinant).
-Whether anything changed at all is asked by plain chi-square tests of the residuals, whole and along each cause.
+Whether anything changed at all is asked by plain tests of the residuals' chi-square, whole and along each cause.
 
 Exactly alike, whatever the poses: axis 1 and spheres that were moved (turned about it), axis n and the camera's mounting
 (turned about it). They are told together, never guessed.
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from calibrate.datum import term_columns
 from calibrate.problem import Problem, State, corrected_chain
@@ -196,13 +196,14 @@ def diagnose(residuals: CheckResiduals, causes: Sequence[Cause]) -> Diagnosis:
     y: FloatArray = np.asarray(np.linalg.solve(factor, residuals.residual_mm.reshape(-1)), dtype=np.float64)
     total, freedom = float(y @ y), len(y)
     shares = _shares(causes, factor)
-    p_values = [float(chi2.sf(total, freedom)) / _SHARE]
+    noise_freedom = residuals.noise_freedom
+    p_values = [_chance(total, freedom, noise_freedom) / _SHARE]
     weighed = []
     for cause, share in zip(causes, shares, strict=True):
         shapes = [_weigh(shape, factor, y) for shape in cause.shapes]
         best = max(range(len(shapes)), key=lambda i: shapes[i][0])
         evidence = float(logsumexp([s[0] for s in shapes], b=np.array([shape.weight for shape in cause.shapes]) / len(cause.shapes)))
-        p_values.append(min(float(chi2.sf(explained, k)) for _, explained, k, _ in shapes) * len(shapes) / share)
+        p_values.append(min(_chance(explained, k, noise_freedom) for _, explained, k, _ in shapes) * len(shapes) / share)
         weighed.append((cause, evidence + np.log(cause.prior), shapes[best]))
     log_total = float(logsumexp([evidence for _, evidence, _ in weighed]))
     explanations = [
@@ -226,6 +227,11 @@ def named(diagnosis: Diagnosis, n_axes: int) -> tuple[str, ...]:
     told = [first.name, *(e.name for e in diagnosis.explanations[1:] if e.probability > ODDS * first.probability)]
     told += [other for axis, other in alike.items() if axis in told and other not in told]
     return tuple(told)
+
+
+def _chance(chi_square: float, freedom: int, noise_freedom: float) -> float:
+    """Of so large a chi-square by noise alone, where the size of the noise is itself an estimate."""
+    return float(f_distribution.sf(chi_square / freedom, freedom, noise_freedom))
 
 
 def _shares(causes: Sequence[Cause], factor: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _SMALLEST_RADIUS_SIGMA_MM = 1e-5
+_LEAST_FREEDOM = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +39,8 @@ class CheckResiduals:
     """(3 m, 3 m) of the residuals where nothing changed."""
     sensitivity: FloatArray
     """(m, 3, P) motion of a residual per unknown of the calibration."""
+    noise_freedom: float
+    """Degrees of freedom that the calibration's noise was estimated with: few make the tails of every test heavier."""
 
     @property
     def n_shots(self) -> int:
@@ -121,7 +124,9 @@ def check_residuals(calibration: Calibration, shots: Sequence[SphereShot]) -> Ch
     sensitivity = rotation @ (inverse @ (sums.moments[:, :3, :-1] @ geometry.columns))
     points = rotation @ (inverse / sums.weight(calibration.noise)[:, None, None]) @ np.swapaxes(rotation, -1, -2)
     covariance = null_covariance_mm2(calibration, problem, geometry, sensitivity, points)
-    return CheckResiduals(problem, geometry, residual, covariance, sensitivity)
+    statistics = calibration.statistics
+    freedom = float(max(3 * statistics.used - statistics.rank, _LEAST_FREEDOM))
+    return CheckResiduals(problem, geometry, residual, covariance, sensitivity, freedom)
 
 
 def null_covariance_mm2(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -15,6 +19,8 @@ from calibrate.observations import SphereShot
 from calibrate.quick_check import check_residuals, known_state
 from calibrate.result import Calibration
 from calibrate.solve import CalibrationSettings
+from drivers.files.ply import encode_ply
+from drivers.files.yaml import dump_yaml
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from drivers.simulated.cell import SimulatedCell
@@ -25,6 +31,7 @@ from tests.support.volume import DIAMETER_MM, VolumeCell, calibrated, observed, 
 STAND = ("A",)
 """Spheres of the calibration that stay where they are."""
 N_SHOTS = 8
+TAKEN_UTC = "2026-01-02T00:00:00Z"
 CAUSES = ("hand-eye", "axis 2", "axis 3", "axis 4", "axis 5", "camera")
 """That a check must name; `axis 1`, `axis 6` and `sphere moved` are told with what they cannot be told from."""
 
@@ -138,3 +145,26 @@ def diagnosis_of(checked: CheckedCell, shots: Sequence[SphereShot]) -> Diagnosis
 def _moved(sphere: SphereTruth, shift: FloatArray) -> SphereTruth:
     x, y, z = (float(c + s) for c, s in zip(sphere.centre_in_base_mm, shift, strict=True))
     return replace(sphere, centre_in_base_mm=(x, y, z))
+
+
+@cache
+def small_checked_cell() -> CheckedCell:
+    """One cell for the quick tests: few shots, a camera model that is not chosen, few candidates."""
+    return checked_cell(61_001, n_calibration=60, n_candidates=70, camera_error="affine", n_points=200)
+
+
+def write_check_session(folder: Path, checked: CheckedCell, shots: Sequence[SphereShot]) -> Path:
+    """Shots as a session on disk."""
+    (folder / "scans").mkdir(parents=True)
+    (folder / "cell.yaml").write_text(checked.volume.text, encoding="utf-8")
+    head = {"format": "spherecal-session/1", "purpose": "verification", "cell": "cell.yaml", "created_utc": TAKEN_UTC, "software": "tests"}
+    (folder / "session.yaml").write_text(dump_yaml(head), encoding="utf-8")
+    lines = []
+    for shot in shots:
+        data = bytes(encode_ply(shot.points_in_camera_mm.astype(np.float32), comments=("unit mm", "frame camera")))
+        scan, joints = f"scans/{shot.index:04d}.ply", np.asarray(shot.joints_rad).tolist()
+        (folder / scan).write_bytes(data)
+        line = {"index": shot.index, "sphere": shot.sphere, "joints_rad": joints, "base_from_flange": None, "scan": scan}
+        lines.append(json.dumps(line | {"sha256": hashlib.sha256(data).hexdigest(), "time_utc": TAKEN_UTC}))
+    (folder / "shots.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder

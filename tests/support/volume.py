@@ -61,6 +61,8 @@ class VolumeCell:
     cell: Cell
     model: RobotModel
     spheres: tuple[str, ...]
+    text: str = ""
+    """The cell file."""
 
 
 def volume_cell(
@@ -78,8 +80,8 @@ def volume_cell(
     if artefact in {"three", "five"}:
         error_mm = rng.normal(0, LENGTH_U_MM / 2, len(lengths))
     certified = [(a, b, float(np.linalg.norm(places[a] - places[b]) + error)) for (a, b), error in zip(lengths, error_mm, strict=True)]
-    cell = _cell(model_name, places, certified)
-    return VolumeCell(SimulatedCell(truth, model), cell, model, calibration)
+    text = _cell_text(model_name, places, certified)
+    return VolumeCell(SimulatedCell(truth, model), parse_cell(text.encode(), path=Path("volume.yaml")), model, calibration, text)
 
 
 def _artefact(name: str, bar_mm: float) -> tuple[dict[str, FloatArray], list[tuple[str, str]]]:
@@ -194,7 +196,7 @@ def _poses(volume: VolumeCell, sphere: str, view: CameraView, n: int, rng: np.ra
     return np.array(found)
 
 
-def _cell(model_name: str, places: Mapping[str, FloatArray], lengths: Sequence[tuple[str, str, float]]) -> Cell:
+def _cell_text(model_name: str, places: Mapping[str, FloatArray], lengths: Sequence[tuple[str, str, float]]) -> str:
     data = {
         "format": "spherecal-cell/1",
         "name": "volume",
@@ -211,4 +213,4 @@ def _cell(model_name: str, places: Mapping[str, FloatArray], lengths: Sequence[t
         "lengths": [{"between": [a, b], "length_mm": length, "expanded_uncertainty_mm": LENGTH_U_MM} for a, b, length in lengths],
         "work_volume_mm": np.array([np.min(list(UNSEEN.values()), axis=0), np.max(list(UNSEEN.values()), axis=0)]).tolist(),
     }
-    return parse_cell(dump_yaml(data).encode(), path=Path("volume.yaml"))
+    return dump_yaml(data)

@@ -16,16 +16,16 @@ from calibrate.result import Calibration
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
-from tests.support.drifting import CheckedCell, check_shots, checked_cell, diagnosis_of
+from tests.support.drifting import CheckedCell, check_shots, diagnosis_of, small_checked_cell
 from tests.support.volume import DIAMETER_MM
 
-SEED = 61_000
+SEED = 61_001
 N_AXES = 6
 
 
 @pytest.fixture(scope="module")
 def checked() -> CheckedCell:
-    return checked_cell(SEED, n_calibration=60, n_candidates=70, camera_error="pillow", n_points=200)
+    return small_checked_cell()
 
 
 def shots_after(checked: CheckedCell, cause: str | None, size: float = 1.0, seed: int = 0) -> list[SphereShot]:
