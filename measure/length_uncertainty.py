@@ -55,25 +55,31 @@ class End:
 
     centre_in_base_mm: FloatArray
     """(3,) fitted on all views together."""
-    shots: Sequence[SphereShot]
+    motion: FloatArray
+    """(3, p + 1) of that centre per calibration parameter and radius offset."""
 
 
 def distance_standard_uncertainty_mm(calibration: KnowsItsCovariance, first: End, second: End) -> float:
     """Standard uncertainty of the distance of two sphere centres, as far as the calibration causes it."""
     difference = second.centre_in_base_mm - first.centre_in_base_mm
     direction = difference / max(float(np.linalg.norm(difference)), 1e-12)
-    gradient = direction @ (_centre_jacobian(calibration, second) - _centre_jacobian(calibration, first))
+    gradient = direction @ (second.motion - first.motion)
     used = calibration.covariance[: len(gradient), : len(gradient)]
     return float(np.sqrt(max(float(gradient @ used @ gradient), 0.0)))
 
 
-def _centre_jacobian(calibration: KnowsItsCovariance, end: End) -> FloatArray:
+def end_of(calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots: Sequence[SphereShot]) -> End:
+    """The end of lengths that a sphere with this common centre (3,) is, seen by some shots; computed once for all its lengths."""
+    return End(centre_in_base_mm, _centre_jacobian(calibration, centre_in_base_mm, shots))
+
+
+def _centre_jacobian(calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots: Sequence[SphereShot]) -> FloatArray:
     """(3, p + 1) motion of a commonly fitted centre per calibration parameter and radius offset."""
     normal, rows = np.zeros((3, 3)), None
-    for shot in end.shots:
+    for shot in shots:
         points = shot.points_in_camera_mm[:: max(1, -(-len(shot.points_in_camera_mm) // _POINTS_PER_VIEW))]
         pose = pose_of(calibration.model, shot)
-        offset = calibration.points_in_base_mm(points, **pose) - end.centre_in_base_mm
+        offset = calibration.points_in_base_mm(points, **pose) - centre_in_base_mm
         unit = offset / np.linalg.norm(offset, axis=1, keepdims=True)
         along = np.einsum("ni,nip->np", unit, calibration.point_jacobian(points, **pose))
         share = unit.T @ np.column_stack([along, -np.ones(len(unit))])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from acquire.sphere_fit import fit_fixed_radius, fit_free_radius
 from drivers.errors import DataError
 from measure.proof.probing import shell_width_mm
-from measure.proof.scatter import OwnCentre, ScatterScale, form_sigma_mm, sandwich, scatter_scale, structured
+from measure.proof.scatter import OwnCentre, ScatterScale, agreed_variance, form_sigma_mm, sandwich, scatter_scale, structured
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -83,7 +83,7 @@ class SphereFigures:
     diameter_error_less_offset_mm: float
     """The same minus twice the calibrated radius offset: what is left when the surface's reading is known."""
     diameter_standard_uncertainty_mm: float
-    """From the scatter between the views: the larger of what they show and what the calibration's noise predicts."""
+    """From the scatter between the views: what the calibration's noise predicts of it, and more where they show more."""
     form_mm: float
     """Width of the thinnest concentric shell that holds 95 % of the points."""
     form_all_mm: float
@@ -144,10 +144,11 @@ def separation(first: SphereFigures, second: SphereFigures) -> tuple[float, floa
     difference = second.centre_in_base_mm - first.centre_in_base_mm
     distance = float(np.linalg.norm(difference))
     direction = difference / max(distance, 1e-12)
-    variances = [float(direction @ (first.centre_covariance_mm2 + second.centre_covariance_mm2) @ direction)]
+    seen = float(direction @ (first.centre_covariance_mm2 + second.centre_covariance_mm2) @ direction)
+    expected = None
     if first.expected_centre_covariance_mm2 is not None and second.expected_centre_covariance_mm2 is not None:
-        variances.append(float(direction @ (first.expected_centre_covariance_mm2 + second.expected_centre_covariance_mm2) @ direction))
-    return distance, float(np.sqrt(max(*variances, 0.0)))
+        expected = float(direction @ (first.expected_centre_covariance_mm2 + second.expected_centre_covariance_mm2) @ direction)
+    return distance, float(np.sqrt(max(agreed_variance(expected, seen, first.n_views + second.n_views - 2), 0.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,13 +179,13 @@ def _sphere_figures(views: Sequence[SphereView], size: SphereSize, fit: _Fit, ow
     radii = np.linalg.norm(fit.points - fit.free_centre, axis=1)
     error = 2.0 * (fit.free_radius_mm - size.radius_mm)
     common, free = (fit.centre, fit.reading_radius_mm), (fit.free_centre, fit.free_radius_mm)
-    radius_variance = [sandwich(fit.points, fit.groups, *free, fit.free_covariance)[3, 3]]
+    seen = float(sandwich(fit.points, fit.groups, *free, fit.free_covariance)[3, 3])
     moves = [scale.factor * centre.covariance_mm2 for centre in own if centre is not None]
-    expected, form_sigma = None, 0.0
+    expected, expected_radius, form_sigma = None, None, 0.0
     if len(moves) == len(views) and (len(views) > 1 or scale.known):
         expected = structured(fit.points, fit.groups, *common, moves, fit.covariance)
-        radius_variance.append(structured(fit.points, fit.groups, *free, moves, fit.free_covariance)[3, 3])
-        form_sigma = max(form_sigma_mm(fit.points, fit.groups, *free, moves, FORM_FRACTION))
+        expected_radius = float(structured(fit.points, fit.groups, *free, moves, fit.free_covariance)[3, 3])
+        form_sigma = form_sigma_mm(fit.points, fit.groups, *free, moves, FORM_FRACTION)
     return SphereFigures(
         name=views[0].sphere,
         n_views=len(views),
@@ -193,7 +194,7 @@ def _sphere_figures(views: Sequence[SphereView], size: SphereSize, fit: _Fit, ow
         centre_covariance_mm2=sandwich(fit.points, fit.groups, *common, fit.covariance),
         diameter_error_mm=error,
         diameter_error_less_offset_mm=error - 2.0 * size.offset_mm,
-        diameter_standard_uncertainty_mm=2.0 * float(np.sqrt(max(radius_variance))),
+        diameter_standard_uncertainty_mm=2.0 * float(np.sqrt(agreed_variance(expected_radius, seen, len(views) - 1))),
         form_mm=shell_width_mm(radii, FORM_FRACTION),
         form_all_mm=float(np.ptp(radii)),
         form_standard_uncertainty_mm=form_sigma,

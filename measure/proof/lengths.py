@@ -11,7 +11,7 @@ import numpy as np
 from acquire.cell import CertifiedLength
 from calibrate.observations import SphereShot
 from drivers.kinematics.se3 import FloatArray
-from measure.length_uncertainty import End, distance_standard_uncertainty_mm
+from measure.length_uncertainty import End, distance_standard_uncertainty_mm, end_of
 from measure.placing import JudgedSystem
 from measure.proof.poses import near, same_poses
 from measure.proof.reach import is_unseen_place
@@ -96,15 +96,24 @@ def length_results(
     by_sphere: dict[str, list[SphereShot]] = {name: [] for name in figures.spheres}
     for shot in shots:
         by_sphere[shot.sphere].append(shot)
-    return tuple(_length(calibration, length, figures, by_sphere) for length in lengths if set(length.between) <= set(figures.spheres))
+    seen = [length for length in lengths if set(length.between) <= set(figures.spheres)]
+    names = {name for length in seen for name in length.between}
+    known = {name: end_of(calibration, figures.spheres[name].centre_in_base_mm, by_sphere[name]) for name in names}
+    return tuple(_length(calibration, length, figures, by_sphere, known) for length in seen)
 
 
-def _length(calibration: JudgedSystem, length: CertifiedLength, figures: Figures, by_sphere: Mapping[str, Sequence[SphereShot]]) -> LengthResult:
+def _length(
+    calibration: JudgedSystem,
+    length: CertifiedLength,
+    figures: Figures,
+    by_sphere: Mapping[str, Sequence[SphereShot]],
+    known: Mapping[str, End],
+) -> LengthResult:
     ends = [figures.spheres[name] for name in length.between]
     measured, scatter = separation(ends[0], ends[1])
     shots = [by_sphere[name] for name in length.between]
     test = float(np.hypot(scatter, length.standard_uncertainty_mm))
-    predicted = distance_standard_uncertainty_mm(calibration, End(ends[0].centre_in_base_mm, shots[0]), End(ends[1].centre_in_base_mm, shots[1]))
+    predicted = distance_standard_uncertainty_mm(calibration, *(known[name] for name in length.between))
     return LengthResult(
         between=length.between,
         measured_mm=measured,
@@ -138,9 +147,10 @@ def _pairs(length_mm: float, shots: Sequence[Sequence[SphereShot]], figures: Fig
         here, there = (centres[shot.session, shot.index, shot.sphere] for shot in (one, other))
         if here is not None and there is not None:
             distances.append(float(np.linalg.norm(there - here)))
-    return _pair_figures(np.array(distances) - length_mm) if distances else None
+    return pair_figures(np.array(distances) - length_mm) if distances else None
 
 
-def _pair_figures(signed_mm: FloatArray) -> PairFigures:
+def pair_figures(signed_mm: FloatArray) -> PairFigures:
+    """Figures of signed errors (n,) of distances between single views."""
     error = np.abs(signed_mm)
     return PairFigures(len(error), float(error.mean()), float(error.max()), float(error.std()), float(signed_mm.mean()))

@@ -1,9 +1,10 @@
 """How uncertain figures of commonly fitted spheres are because each view stands a little elsewhere.
 
-Two estimates, of which the larger counts. The *sandwich* takes the residuals as they are; with few views it hardly sees
+Two estimates. The *sandwich* takes the residuals as they are; with few views it hardly sees
 a scatter that the common fit has swallowed. The *structured* one moves every view as a whole, by what the calibration's
 noise says of its pose and by what its points leave open, and sees how the common fit follows; its size is corrected by
-the scatter of the views' own centres, pooled over all spheres, with a Student factor for how few there are.
+the scatter of the views' own centres, pooled over all spheres, with a Student factor for how few there are. The
+structured one counts, unless a sphere's own sandwich exceeds it by more than chance.
 """
 
 from __future__ import annotations
@@ -60,6 +61,20 @@ def student_factor(freedom: int) -> float:
     return float(stdtrit(freedom, 0.95)) / _NORMAL_95
 
 
+def agreed_variance(expected: float | None, seen: float, freedom: int) -> float:
+    """The variance to claim: what is expected, unless what is seen on so few degrees of freedom exceeds it beyond chance (95 %).
+
+    Taking the larger of the two always would claim too much: with few views the seen one is mostly chance.
+    """
+    if expected is None:
+        return seen
+    if freedom < 1:
+        return expected
+    from scipy.special import chdtri
+
+    return seen if seen > expected * float(chdtri(freedom, 0.05)) / freedom else expected
+
+
 def scatter_scale(spheres: Sequence[Sequence[OwnCentre]], *, known: bool) -> ScatterScale:
     """Compare the centres of the views of each sphere with what they should scatter by, about their weighted mean."""
     total, freedom = 0.0, 0
@@ -101,13 +116,11 @@ def structured(
     return np.asarray(np.einsum("jki,jim,jlm->kl", follows, np.stack(views), follows) + fallback)
 
 
-def form_sigma_mm(
-    points: FloatArray, groups: IntArray, centre: FloatArray, radius_mm: float, views: Sequence[FloatArray], share: float
-) -> tuple[float, float]:
-    """Standard uncertainty of the form shell: by leaving out one view after the other, and by moving them as they should scatter.
+def form_sigma_mm(points: FloatArray, groups: IntArray, centre: FloatArray, radius_mm: float, views: Sequence[FloatArray], share: float) -> float:
+    """Standard uncertainty of the form shell: by moving views as they should scatter, and by leaving out one after the other.
 
-    The first is the jackknife over views (0 with one view). The second moves every view by draws from its covariance
-    (3, 3), lets the free-radius sphere follow, and takes the standard deviation of the shell's width.
+    The first moves every view by draws from its covariance (3, 3), lets the free-radius sphere follow, and takes the
+    standard deviation of the shell's width. The second is the jackknife over views; it counts beyond chance only.
     """
     n_views = len(views)
     # displaced views make the shell, not the number of their points
@@ -117,7 +130,7 @@ def form_sigma_mm(
     jackknife = 0.0
     if n_views > 1:
         left_out = np.array([shell_width_mm(radii[groups != j], share) for j in range(n_views)])
-        jackknife = float(np.sqrt((n_views - 1) * np.mean((left_out - left_out.mean()) ** 2))) * student_factor(n_views - 1)
+        jackknife = float(np.sqrt((n_views - 1) * np.mean((left_out - left_out.mean()) ** 2)))
     design, _ = _design(points, centre, radius_mm, free=True)
     follows = _follows(points, groups, centre, radius_mm, n_views, free=True)
     # the draws are a quadrature, the same every time
@@ -127,7 +140,7 @@ def form_sigma_mm(
     for moved in draws:
         followed = np.einsum("jki,ji->k", follows, moved)
         widths.append(shell_width_mm(radii + np.einsum("ni,ni->n", design[:, :3], moved[groups]) - design @ followed, share))
-    return jackknife, float(np.std(widths))
+    return float(np.sqrt(agreed_variance(float(np.var(widths)), jackknife**2, n_views - 1)))
 
 
 def _design(points: FloatArray, centre: FloatArray, radius_mm: float, *, free: bool) -> tuple[FloatArray, FloatArray]:
