@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from measure.cli_history import HistoryPlace
 from measure.cli_run import EXIT_INTERRUPTED, EXIT_NOT_GOOD, AsJson, Debug, Quiet, command
 
 if TYPE_CHECKING:
@@ -32,6 +34,9 @@ def run_jobs(
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
     scheduler: Annotated[str | None, typer.Option("--scheduler", help="Dask scheduler on this computer instead: tcp://127.0.0.1:PORT.")] = None,
     cell: Annotated[Path | None, typer.Option("--cell", help="Cell file, for folders of scans and poses.")] = None,
+    nominal: Annotated[Path | None, typer.Option("--nominal", help="Mesh of the part, mm: every cloud is inspected.")] = None,
+    spec: Annotated[Path | None, typer.Option("--spec", help="inspection.yaml: features, alignment, tolerances.")] = None,
+    history: HistoryPlace = None,
     voxel: Annotated[float, typer.Option("--voxel", help="Edge of the voxels, mm.")] = 0.5,
     keep_edges: Annotated[bool, typer.Option("--keep-edges", help="Keep flying pixels.")] = False,
     memory: Annotated[float | None, typer.Option("--memory", min=1, help="MB for all jobs at work; 70 % of what is free if left out.")] = None,
@@ -53,7 +58,7 @@ def run_jobs(
     with command(as_json, debug, quiet) as run:
         from measure.jobs.runner import RunSettings
 
-        recipe, files = _recipe(out, calibration, cell, voxel, not keep_edges)
+        recipe, files = _recipe(out, calibration, cell, nominal, spec, voxel, not keep_edges)
         settings = RunSettings(
             once=once,
             finite=not parts.is_dir(),
@@ -63,6 +68,8 @@ def run_jobs(
             poll_s=poll,
             give_up_after_s=give_up_after * 3600.0,
             memory_mb=memory,
+            n_threads=1 if scheduler is not None else max(1, (os.cpu_count() or 1) // workers),
+            history=_history(history, calibration),
             retry_dead=retry_dead,
         )
         summary = _worked(run.console, out, recipe, files, _lister(parts), settings, workers, scheduler, timeout)
@@ -108,14 +115,24 @@ def status(
         run.finish({**figures.to_json_dict(), "is_running": running, "dead_letters": dead, "out": page})
 
 
-def _recipe(out: Path, calibration: Path, cell: Path | None, voxel_mm: float, clean_edges: bool) -> tuple[Recipe, Files]:
+def _history(option: str | None, calibration: Path) -> str | None:
+    """Its place, as workers elsewhere find it too."""
+    from measure.history.database import is_url
+    from measure.history.recording import place_of
+
+    place = place_of(option, calibration)
+    return place if place is None or is_url(place) else str(Path(place).absolute())
+
+
+def _recipe(
+    out: Path, calibration: Path, cell: Path | None, nominal: Path | None, spec: Path | None, voxel_mm: float, clean_edges: bool
+) -> tuple[Recipe, Files]:
     """What is done with every part, its files copied beside the results.
 
     Raises:
         FileError: one of them is missing or broken, or the folder cannot be written.
-        SettingsError: the voxel size is no positive number.
+        SettingsError: the voxel size is no positive number, or a specification without a mesh.
     """
-    from acquire.cell import load_cell
     from calibrate.result import Calibration
     from drivers.errors import SettingsError
     from measure.jobs.model import Files, Recipe
@@ -123,13 +140,33 @@ def _recipe(out: Path, calibration: Path, cell: Path | None, voxel_mm: float, cl
 
     if not 0 < voxel_mm < float("inf"):
         raise SettingsError(f"voxel size {voxel_mm} mm is not a positive number", where="--voxel", remedy="Choose for example 0.5.")
+    if spec is not None and nominal is None:
+        raise SettingsError("a specification without a mesh", where="--spec", remedy="Name the mesh with --nominal.")
     loaded = Calibration.load(calibration)
-    if cell is not None:
-        load_cell(cell)
+    _check_readable(cell, nominal, spec)
     prepare(out)
     calibration_copy, _ = keep_copy(out, calibration)
-    cell_copy, cell_sha256 = (None, None) if cell is None else keep_copy(out, cell)
-    return Recipe(loaded.id, voxel_mm, clean_edges, cell_sha256), Files(calibration_copy, cell_copy)
+    (cell_copy, cell_sha256), (mesh, mesh_sha256), (spec_copy, spec_sha256) = (
+        (None, None) if path is None else keep_copy(out, path) for path in (cell, nominal, spec)
+    )
+    recipe = Recipe(loaded.id, voxel_mm, clean_edges, cell_sha256, mesh_sha256, spec_sha256)
+    return recipe, Files(calibration_copy, cell_copy, mesh, spec_copy)
+
+
+def _check_readable(cell: Path | None, nominal: Path | None, spec: Path | None) -> None:
+    """See that the recipe's files are whole before a thousand jobs find out; FileError where one is not."""
+    from acquire.cell import load_cell
+
+    if cell is not None:
+        load_cell(cell)
+    if nominal is not None:
+        from measure.inspecting.nominal import load_nominal
+
+        load_nominal(nominal)
+    if spec is not None:
+        from measure.inspecting.spec import load_spec
+
+        load_spec(spec)
 
 
 def _lister(parts: Path) -> Callable[[], Iterable[Path]]:
@@ -164,9 +201,10 @@ def _worked(
     """Run until it is over, the workers let go afterwards."""
     from measure.jobs.runner import Runner
 
+    recorder = _recorder(settings.history, files.calibration) if settings.history is not None and files.nominal is not None else None
     executor = _executor(workers, scheduler, timeout_s)
     try:
-        runner = Runner(out, recipe, files, list_parts, executor, settings)
+        runner = Runner(out, recipe, files, list_parts, executor, settings, recorder=recorder)
         with _stopped_by_signals(runner, console), console.progress("parts") as advance:
 
             def on_event(summary: Summary, n_left: int) -> None:
@@ -176,6 +214,14 @@ def _worked(
             return runner.run(on_event)
     finally:
         executor.close()
+
+
+def _recorder(history: str, calibration: Path) -> Callable[[Path], None]:
+    from calibrate.result import Calibration
+    from measure.jobs.inspection import record_inspection
+
+    loaded = Calibration.load(calibration)
+    return lambda folder: record_inspection(history, loaded, calibration, folder)
 
 
 def _executor(workers: int, scheduler: str | None, timeout_s: float) -> Executor:

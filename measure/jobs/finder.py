@@ -32,11 +32,13 @@ class Finder:
         settle_s: float,
         give_up_after_s: float,
         memory_mb: float,
+        n_threads: int,
         retry_dead: bool = False,
     ) -> None:
         self._journal, self._recipe, self._list_parts, self._out, self._bury = journal, recipe, list_parts, out, bury
         self._recipe_digest = recipe.digest
         self._settle_s, self._give_up_after_s, self._memory_mb = settle_s, give_up_after_s, memory_mb
+        self._n_threads = n_threads
         self._again = {r.id for r in journal.state.jobs.values() if r.state == "dead" and r.recipe == self._recipe_digest} if retry_dead else set()
         self._sweep: Iterator[None] | None = None
         self.jobs: dict[str, Job] = {}
@@ -105,7 +107,7 @@ class Finder:
             input_digest=input_digest(folder, kind, self._recipe.cell_sha256),
             fingerprint=contents.fingerprint,
             recipe_digest=self._recipe_digest,
-            memory_mb=estimated_mb(contents.scan_bytes),
+            memory_mb=estimated_mb(contents.scan_bytes, self._n_threads),
         )
         self._register(job, self._unfit(job, look.reason if look.state == "held" else None, contents))
         return "found"

@@ -76,16 +76,6 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class LastCheck:
-    """The last quick check of a calibration, as the history tells it."""
-
-    time_utc: str
-    verdict: str
-    """conform, not_proven or reject."""
-    overdue: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Order:
     """A job as it travels to a worker."""
 
@@ -95,7 +85,10 @@ class Order:
     out: Path
     """The folder of results, journal and dead letters."""
     attempt: int
-    last_check: LastCheck | None = None
+    n_threads: int = 1
+    """Scans to work on at a time; changes no bit of the result."""
+    history: str | None = None
+    """Place of the cell's history; it is asked for the last quick check."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,6 @@ from drivers.errors import FileError
 from measure.jobs.failures import failure_of
 from measure.jobs.finder import Finder
 from measure.jobs.journal import Event, JobRecord, Journal
-from measure.jobs.marks import Checks, no_history
 from measure.jobs.memory import budget_mb
 from measure.jobs.model import DEAD_LETTER_FORMAT, Failure, Files, Order, Outcome, Recipe
 from measure.jobs.outputs import clear_abandoned, prepare, read_result, remove_dead_letter, result_folder, write_dead_letter
@@ -34,7 +33,7 @@ _LOOK_S = 0.25
 _PAGE_S = 30.0
 _LONGEST_BACK_OFF_S = 300.0
 Recorder = Callable[[Path], None]
-"""Told the folder of every new result, for the history."""
+"""Told the folder of every new result, for the history; more than once after a kill."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,12 @@ class RunSettings:
     """After which a part that never completes is a dead letter."""
     memory_mb: float | None = None
     """For all jobs in flight together; a share of what is free if None."""
+    n_threads: int = 1
+    """Of each job."""
+    history: str | None = None
+    """Place of the cell's history."""
     retry_dead: bool = False
+    """Try again what earlier runs gave up."""
 
 
 @dataclass(slots=True)
@@ -99,11 +103,10 @@ class Runner:
         executor: Executor,
         settings: RunSettings,
         *,
-        checks: Checks = no_history,
         recorder: Recorder | None = None,
     ) -> None:
         self._out, self._recipe, self._files, self._executor, self._settings = out, recipe, files, executor, settings
-        self._list_parts, self._checks, self._recorder = list_parts, checks, recorder
+        self._list_parts, self._recorder = list_parts, recorder
         self._memory_mb = budget_mb() if settings.memory_mb is None else settings.memory_mb
         self._ready: deque[str] = deque()
         self._later: list[tuple[float, str]] = []
@@ -144,6 +147,7 @@ class Runner:
                 settle_s=settings.settle_s,
                 give_up_after_s=settings.give_up_after_s,
                 memory_mb=self._memory_mb,
+                n_threads=settings.n_threads,
                 retry_dead=settings.retry_dead,
             )
             while not self._is_over():
@@ -164,6 +168,8 @@ class Runner:
         for record in list(self._journal.state.jobs.values()):
             if record.state == "running":
                 text = read_result(result_folder(self._out, record.name))
+                if text is not None:
+                    self._record(record)
                 done: Event = {"event": "done", "job": record.id, "seconds": None, "facts": None if text is None else facts_of_result(text)}
                 events.append({"event": "interrupted", "job": record.id} if text is None else done)
         self._journal.write(*events)
@@ -207,8 +213,8 @@ class Runner:
                 break
             self._ready.popleft()
             self._flying[job.id] = job.memory_mb
-            attempt = self._journal.state.jobs[job.id].attempts + 1
-            orders.append(Order(job, self._recipe, self._files, self._out.absolute(), attempt, self._checks(self._recipe.calibration_id)))
+            attempt, settings = self._journal.state.jobs[job.id].attempts + 1, self._settings
+            orders.append(Order(job, self._recipe, self._files, self._out.absolute(), attempt, settings.n_threads, settings.history))
         self._journal.write(*({"event": "started", "job": order.job.id, "attempt": order.attempt} for order in orders))
         for order in orders:
             self._executor.submit(order.job.id, order)
@@ -228,6 +234,7 @@ class Runner:
         """The event that an outcome makes; a failed job that may succeed is put off."""
         failure, record = outcome.failure, self._journal.state.jobs[job_id]
         if failure is None:
+            self._record(record)
             return {"event": "done", "job": job_id, "seconds": outcome.seconds, "worker": outcome.worker, "facts": outcome.facts}
         if failure.transient and record.attempts < self._settings.retries:
             self._summary.retried += 1
@@ -261,6 +268,9 @@ class Runner:
         self._summary.rejected += outcome.facts.get("verdict") == "reject"
         self._summary.marked += bool(outcome.facts.get("marks"))
         remove_dead_letter(self._out, record.name)
+
+    def _record(self, record: JobRecord) -> None:
+        """Hand a result to the history, before the journal calls it done: after a kill in between it is handed over again."""
         if self._recorder is not None:
             try:
                 self._recorder(result_folder(self._out, record.name))

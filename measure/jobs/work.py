@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 
 from drivers.errors import DataError, SettingsError
 from measure.jobs.failures import failure_of
-from measure.jobs.marks import trust_marks
+from measure.jobs.marks import trust_in
+from measure.jobs.memory import TABLE_MB
 from measure.jobs.model import RESULT_FORMAT, Order, Outcome
 from measure.jobs.outputs import RESULT_FILE, attempt_folder, commit, read_result, result_folder
 
@@ -54,13 +55,8 @@ def facts_of_result(text: str) -> dict[str, object]:
     """What journal and page keep of a result.json."""
     result = json.loads(text)
     stitched = result["stitch"]
-    return {
-        "verdict": result["verdict"],
-        "marks": result["marks"],
-        "n_scans": stitched["n_scans"],
-        "n_points": stitched["n_points"],
-        "n_points_in": stitched["n_points_in"],
-    }
+    kept = {key: stitched[key] for key in ("n_scans", "n_points", "n_points_in")}
+    return {"verdict": result["verdict"], "marks": result["marks"], **kept}
 
 
 def _facts_of_earlier(order: Order) -> dict[str, object] | None:
@@ -83,12 +79,13 @@ def _measured(order: Order, began: float) -> dict[str, object]:
 
 def _fill(order: Order, calibration: Calibration, session: Session, working: Path, began: float) -> str:
     """Measure into a folder; the text of its result.json."""
-    from acquire.identity import identity_marks
     from measure.console import json_text
+    from measure.history.recording import last_taken_utc
     from measure.running_record import now_utc
 
-    marks = [*identity_marks(calibration.identity, session), *trust_marks(calibration.verdict, order.last_check)]
-    stitched = _stitched(order, calibration, session, working)
+    trust = trust_in(order.history, calibration, session)
+    stitched, marks = _stitched(order, calibration, session, working)
+    inspection = _inspected(order, calibration, session, working)
     result = {
         "format": RESULT_FORMAT,
         "part": order.job.part,
@@ -96,10 +93,12 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
         "source": order.job.source,
         "inputs": {"digest": order.job.input_digest, "recipe": order.job.recipe_digest, **asdict(order.recipe)},
         "calibration": {"id": calibration.id, "verdict": calibration.verdict, "created_utc": calibration.created_utc},
-        "last_check": None if order.last_check is None else asdict(order.last_check),
-        "marks": marks,
-        "verdict": None,
+        "last_check": trust.last_check_data(),
+        "taken_utc": last_taken_utc([session]),
+        "marks": [*marks, *trust.marks],
+        "verdict": None if inspection is None else inspection["verdict"],
         "stitch": stitched,
+        "inspection": inspection,
         "seconds": time.perf_counter() - began,
         "attempt": order.attempt,
         "time_utc": now_utc(),
@@ -109,11 +108,24 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
     return text
 
 
-def _stitched(order: Order, calibration: Calibration, session: Session, working: Path) -> Mapping[str, object]:
-    from measure.stitch import stitch
+def _stitched(order: Order, calibration: Calibration, session: Session, working: Path) -> tuple[Mapping[str, object], list[str]]:
+    """The cloud's facts, and what speaks against them."""
+    from measure.stitch import StitchSettings, stitch
+    from measure.stitching.scan import DEFAULT_CLEANING, NO_CLEANING
 
-    result = stitch(calibration, session, working / CLOUD_FILE, order.recipe.voxel_mm, clean_edges=order.recipe.clean_edges)
-    return {**result.to_json_dict(), "out": CLOUD_FILE}
+    cleaning = DEFAULT_CLEANING if order.recipe.clean_edges else NO_CLEANING
+    settings = StitchSettings(order.recipe.voxel_mm, cleaning, memory_mb=TABLE_MB, n_threads=order.n_threads)
+    result = stitch(calibration, session, working / CLOUD_FILE, settings=settings)
+    return {**result.to_json_dict(), "out": CLOUD_FILE}, list(result.marks)
+
+
+def _inspected(order: Order, calibration: Calibration, session: Session, working: Path) -> Mapping[str, object] | None:
+    """The cloud against its nominal, where there is one."""
+    if order.files.nominal is None:
+        return None
+    from measure.jobs.inspection import inspect_part
+
+    return inspect_part(calibration, session, working / CLOUD_FILE, order.files.nominal, order.files.spec, working)
 
 
 @lru_cache(maxsize=2)

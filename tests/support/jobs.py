@@ -15,7 +15,6 @@ from calibrate.result import Calibration
 from drivers.files.disk import sha256_hex
 from drivers.files.ply import encode_ply
 from drivers.files.yaml import dump_yaml
-from measure.jobs.marks import Checks, no_history
 from measure.jobs.model import Files, Order, Outcome, Recipe, Work
 from measure.jobs.outputs import keep_copy, prepare
 from measure.jobs.parts import parts_in
@@ -149,20 +148,19 @@ def run_jobs(
     executor: Executor | None = None,
     *,
     recipe: Recipe | None = None,
-    checks: Checks = no_history,
+    history: str | None = None,
     on_made: Callable[[Runner], None] | None = None,
     retry_dead: bool = False,
     memory_mb: float | None = None,
     give_up_after_s: float = 3600.0,
 ) -> Summary:
     """Drain a folder in this process."""
-    settings = RunSettings(
-        once=True, settle_s=0.0, poll_s=0.01, back_off_s=0.01, retry_dead=retry_dead, memory_mb=memory_mb, give_up_after_s=give_up_after_s
-    )
+    settings = RunSettings(once=True, settle_s=0.0, poll_s=0.01, back_off_s=0.01, history=history, retry_dead=retry_dead)
+    settings = replace(settings, memory_mb=memory_mb, give_up_after_s=give_up_after_s)
     prepare(out)
     copy, _ = keep_copy(out, parts.calibration)
     given = recipe or Recipe(Calibration.load(copy).id)
-    runner = Runner(out, given, Files(copy), lambda: parts_in(parts.folder), executor or InPlace(), settings, checks=checks)
+    runner = Runner(out, given, Files(copy), lambda: parts_in(parts.folder), executor or InPlace(), settings)
     if on_made is not None:
         on_made(runner)
     return runner.run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import shutil
 from collections.abc import Callable
@@ -12,19 +13,20 @@ import pytest
 from calibrate.result import Calibration
 from drivers.errors import FileError
 from drivers.files.session import read_session
+from measure.history.store import History
 from measure.jobs import outputs
 from measure.jobs import runner as runner_module
 from measure.jobs import work as work_module
 from measure.jobs.failures import TOO_LARGE, UNFINISHED, failure_of
 from measure.jobs.journal import Event, Journal, read_state
 from measure.jobs.memory import estimated_mb
-from measure.jobs.model import LastCheck, Order, Outcome, Recipe
+from measure.jobs.model import Order, Outcome, Recipe
 from measure.jobs.outputs import attempt_folder, clear_abandoned, commit
 from measure.jobs.parts import MARKER
 from measure.jobs.work import CLOUD_FILE
 from measure.stitch import stitch
 from tests.support.job_works import light, moody
-from tests.support.jobs import DAMAGE, InPlace, Parts, make_parts, run_jobs, without_joints
+from tests.support.jobs import DAMAGE, InPlace, Parts, make_parts, read_lines, run_jobs, without_joints
 
 EXPECTED = {
     "truncated scan": "is cut off",
@@ -93,20 +95,36 @@ def test_a_result_is_what_stitch_writes_and_names_its_calibration(good: Parts, t
         assert result["marks"] == []
 
 
-@pytest.mark.parametrize(
-    ("check", "mark"),
-    [
-        (LastCheck("2026-01-02T03:04:05Z", "conform"), None),
-        (LastCheck("2026-01-02T03:04:05Z", "reject"), "the last quick check failed"),
-        (LastCheck("2026-01-02T03:04:05Z", "conform", overdue=True), "overdue"),
-    ],
-)
-def test_a_failed_or_overdue_check_marks_the_result(good: Parts, tmp_path: Path, check: LastCheck, mark: str | None) -> None:
-    summary = run_jobs(good, tmp_path / "out", checks=lambda _id: check)
-    result = json.loads(next((tmp_path / "out" / "results").glob("*/result.json")).read_text(encoding="utf-8"))
-    assert result["last_check"]["time_utc"] == check.time_utc
-    assert [mark] == [mark and (mark if any(mark in text for text in result["marks"]) else "missing")]
-    assert summary.marked == (0 if mark is None else 2)
+def test_a_failed_or_overdue_check_marks_the_result_that_names_it(good: Parts, tmp_path: Path) -> None:
+    """One after the other in the same history: none yet, a good one, an overdue one, a failed one."""
+    calibration = Calibration.load(good.calibration)
+    place = str(tmp_path / "history.sqlite")
+
+    def result(voxel_mm: float) -> tuple[dict[str, object] | None, str]:
+        summary = run_jobs(good, tmp_path / "out", history=place, recipe=Recipe(calibration.id, voxel_mm))
+        found = max((tmp_path / "out" / "results").glob("*/result.json"), key=lambda path: path.stat().st_mtime_ns)
+        data = json.loads(found.read_text(encoding="utf-8"))
+        assert summary.marked == (2 if data["marks"] else 0)
+        return data["last_check"], " ".join(data["marks"])
+
+    def checked(taken_utc: str, verdict: str) -> None:
+        with History.open(place) as history:
+            history.add_calibration(calibration, good.calibration)
+            content = {"verdict": verdict, "taken": taken_utc}
+            history.add_result("check", calibration, content, verdict=verdict, taken_utc=taken_utc, software="test")
+
+    assert result(0.5) == (None, "")
+    taken = str(read_lines(good.folder / good.good[0])[0]["time_utc"])
+    old = (datetime.datetime.fromisoformat(taken) - datetime.timedelta(hours=30)).isoformat()
+    checked(old, "conform")
+    assert result(0.6) == ({"taken_utc": old, "verdict": "conform"}, "")
+    with History.open(place) as history:
+        history.set_check_every(calibration.cell_name, 24.0)
+    assert "overdue" in result(0.7)[1]
+    checked(taken, "reject")
+    last, marks = result(0.8)
+    assert last == {"taken_utc": taken, "verdict": "reject"}
+    assert "failed" in marks
 
 
 def test_a_repaired_part_is_found_anew_and_its_dead_letter_goes(parts: Parts, made: Parts, tmp_path: Path) -> None:
@@ -179,7 +197,7 @@ def test_errors_are_judged_by_what_caused_them(error: Exception, transient: bool
 
 
 def test_jobs_in_flight_share_the_memory_and_a_larger_one_is_told(good: Parts, tmp_path: Path) -> None:
-    one = estimated_mb([path.stat().st_size for path in (good.folder / good.good[0] / "scans").iterdir()])
+    one = estimated_mb([path.stat().st_size for path in (good.folder / good.good[0] / "scans").iterdir()], 1)
     for i in range(4):
         shutil.copytree(good.folder / good.good[0], good.folder / f"more{i}")
     executor = InPlace(light, n_workers=6)
