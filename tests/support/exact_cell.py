@@ -37,7 +37,7 @@ class ExactCell:
 
     @classmethod
     def write(cls, folder: Path, seed: int) -> ExactCell:
-        """The demo cell of a seed, its camera without noise or error, its spheres as their certificates say."""
+        """The demo cell of a seed without its workpiece, its camera without noise or error, its spheres as their certificates say."""
         cell = load_cell(write_demo_cell(folder, seed=seed, resolution_px=SIZE_PX))
         truth = load_truth(folder / "truth.yaml")
         quiet = replace(truth.camera, range_noise_mm=0.0, flying_pixel_fraction=0.0, invalid_fraction=0.0, incidence_softness_deg=0.0)
@@ -45,7 +45,7 @@ class ExactCell:
         spheres = {name: replace(sphere, optical_offset_mm=0.0) for name, sphere in truth.spheres.items()}
         model = robot_model_of(cell)
         assert model is not None
-        return cls(cell, SimulatedCell(replace(truth, camera=camera, spheres=spheres), model, folder=folder))
+        return cls(cell, SimulatedCell(replace(truth, camera=camera, spheres=spheres, workpiece=None), model, folder=folder))
 
     def expose(self) -> NDArray[np.float32]:
         """What the camera would see now, for cameras that are fed with it; no time passes."""
