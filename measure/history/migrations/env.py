@@ -1,9 +1,11 @@
-"""What alembic runs: the connection is handed over by `measure.history.store`, which also holds the lock."""
+"""What alembic runs: the connection is handed over by `measure.history.database`, which also holds the lock."""
 
 from __future__ import annotations
 
 from alembic import context
 
-connection = context.config.attributes["connection"]
-context.configure(connection=connection, transaction_per_migration=False, transactional_ddl=False)
-context.run_migrations()
+# there is a configuration only while alembic runs this
+_config = getattr(context, "config", None)
+if _config is not None:
+    context.configure(connection=_config.attributes["connection"], transaction_per_migration=False, transactional_ddl=False)
+    context.run_migrations()
