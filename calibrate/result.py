@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from acquire.cell import Limits
 from acquire.plan import PlannedPose
@@ -189,19 +189,22 @@ class Calibration:
         Raises:
             SettingsError: not exactly the one of the two that fits this calibration, or a wrong shape.
         """
-        measured = _points(points_in_camera_mm)
+        given = np.asarray(points_in_camera_mm)
+        # a whole scan of float32 is not copied
+        measured = given if given.dtype == np.float32 and given.shape[1:] == (3,) else _points(points_in_camera_mm)
         base_from_camera = self._flange(joints_rad, base_from_flange, len(measured)) @ self.flange_from_camera
         if base_from_camera.ndim == 2 and len(measured) >= _COMPILED_FROM:
             return self._placed(measured, base_from_camera)
+        measured = _points(measured)
         corrected = measured + self.camera_correction_mm(measured)
         if base_from_camera.ndim == 2:
             return np.asarray(corrected @ base_from_camera[:3, :3].T + base_from_camera[:3, 3])
         return se3.apply(base_from_camera, corrected)
 
-    def _placed(self, points_in_camera_mm: FloatArray, base_from_camera: FloatArray) -> FloatArray:
+    def _placed(self, points_in_camera_mm: NDArray[np.floating], base_from_camera: FloatArray) -> FloatArray:
         from calibrate.placing_kernels import place_points
 
-        result = np.empty_like(points_in_camera_mm)
+        result = np.empty(points_in_camera_mm.shape)
         place_points(points_in_camera_mm, self.camera_error.polynomials, self.camera_mm, base_from_camera, result)
         return result
 

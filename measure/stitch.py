@@ -140,8 +140,8 @@ class Stitcher:
         Raises:
             DataError: the shot lacks the pose that the calibration needs, its scan is in another unit, or a voxel is overfull.
         """
-        scan = prepare_scan(self._calibration, self._session, shot, cloud, self._cleaning)
         full = self.grid.full
+        scan = prepare_scan(self._calibration, self._session, shot, cloud, self._cleaning, full=full)
         added = self.grid.add(
             scan.points_in_base_mm, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None
         )

@@ -18,7 +18,9 @@ from measure.placing import MeasuringSystem, points_of_shot_in_base_mm
 if TYPE_CHECKING:
     from measure.stitching.scan_kernels import PointNoise, View
 
-_LATTICE = (6, 5, 4)
+_LATTICE = (5, 5, 3)
+_COVARIANCE_EVERY = 8
+"""Pixels of a row that share one covariance: it changes over centimetres."""
 _REFERENCE_LEVER_MM = 500.0
 _LINES_LOOKED_AT = 32
 _SMALLEST_SCAN_MM = 20.0
@@ -97,8 +99,8 @@ def unit_variance_mm2(noise: NoiseModel) -> float:
     return noise.pose_mm**2 + (noise.pose_rad * _REFERENCE_LEVER_MM) ** 2 + noise.form_mm**2 + noise.point_mm**2
 
 
-def prepare_scan(system: StitchingSystem, session: Session, shot: Shot, cloud: PointCloud, cleaning: Cleaning) -> PreparedScan:
-    """Correct, move, clean and weigh the points of a shot.
+def prepare_scan(system: StitchingSystem, session: Session, shot: Shot, cloud: PointCloud, cleaning: Cleaning, *, full: bool = True) -> PreparedScan:
+    """Correct, move, clean and weigh the points of a shot; the variances are zero where not all (`full`) is wanted.
 
     Raises:
         DataError: the shot lacks the pose that the calibration needs, or its scan is in another unit.
@@ -124,9 +126,10 @@ def prepare_scan(system: StitchingSystem, session: Session, shot: Shot, cloud: P
     else:
         kernels.weigh_loose(in_base.reshape(1, -1, 3), view, noise, weights.reshape(1, -1), fates)
     variances = np.zeros((height, width), dtype=np.uint32)
-    if weights.any():
+    if full and weights.any():
         low, spacing, covariances = _lattice(system, shot, in_camera)
-        kernels.variances_along_normals(in_camera, in_base, view, low, spacing, covariances, weights, normals, variances)
+        every = _COVARIANCE_EVERY if np.isfinite(step) else 1
+        kernels.variances_along_normals(in_camera, in_base, view, low, spacing, covariances, every, weights, normals, variances)
     n_valid = height * width - int(fates[kernels.INVALID])
     return PreparedScan(in_base, weights, normals, variances, n_valid, *(int(fates[i]) for i in (kernels.EDGE, kernels.GRAZING, kernels.SPECK)))
 
@@ -175,7 +178,7 @@ def _point_noise(noise: NoiseModel) -> PointNoise:
 
 def _lattice(system: StitchingSystem, shot: Shot, in_camera: NDArray[np.float32]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Lower corner (3,) and spacing (3,) of a lattice over x/z, y/z and z, and the calibration's covariances (a, b, c, 6) on it."""
-    some = in_camera.reshape(-1, 3)[:: max(1, in_camera.size // 150_000)].astype(np.float64)
+    some = in_camera.reshape(-1, 3)[:: max(1, in_camera.size // 15_000)].astype(np.float64)
     some = some[np.isfinite(some).all(axis=1) & (np.abs(some[:, 2]) > 1e-3)]
     if not len(some):
         some = np.array([[0.0, 0.0, 400.0]])

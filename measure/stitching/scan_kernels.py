@@ -281,6 +281,23 @@ def weigh_loose(points_mm: FloatArray, view: View, noise: PointNoise, weights: N
 
 
 @compiled
+def _interpolated(
+    point_in_camera_mm: NDArray[np.float32], lattice_low: FloatArray, lattice_step: FloatArray, covariances: FloatArray, mean: FloatArray
+) -> None:
+    z = np.float64(point_in_camera_mm[2])
+    i, fi = _cell((point_in_camera_mm[0] / z - lattice_low[0]) / lattice_step[0], covariances.shape[0])
+    j, fj = _cell((point_in_camera_mm[1] / z - lattice_low[1]) / lattice_step[1], covariances.shape[1])
+    k, fk = _cell((z - lattice_low[2]) / lattice_step[2], covariances.shape[2])
+    mean[:] = 0.0
+    for di in range(2):
+        for dj in range(2):
+            share = (fi if di else 1.0 - fi) * (fj if dj else 1.0 - fj)
+            near, far = share * (1.0 - fk), share * fk
+            for entry in range(6):
+                mean[entry] += near * covariances[i + di, j + dj, k, entry] + far * covariances[i + di, j + dj, k + 1, entry]
+
+
+@compiled
 def variances_along_normals(
     points_in_camera_mm: NDArray[np.float32],
     points_mm: FloatArray,
@@ -288,6 +305,7 @@ def variances_along_normals(
     lattice_low: FloatArray,
     lattice_step: FloatArray,
     covariances: FloatArray,
+    taken_every: int,
     weights: NDArray[np.uint8],
     normals: NDArray[np.int16],
     variances: NDArray[np.uint32],
@@ -295,26 +313,19 @@ def variances_along_normals(
     """The calibration's variance (h, w) along the normal, along the sight where there is none, in steps of VARIANCE_STEP_MM2.
 
     Covariances (a, b, c, 6) stand on a lattice over x/z, y/z and z of the camera frame, as xx xy xz yy yz zz; between its
-    nodes they are interpolated, which keeps them covariances.
+    nodes they are interpolated, which keeps them covariances. Neighbours in a row share the one taken at the first of
+    `taken_every` of them.
     """
-    a, b, c = covariances.shape[0], covariances.shape[1], covariances.shape[2]
     mean = np.zeros(6)
     for v in range(points_mm.shape[0]):
+        until = 0
         for u in range(points_mm.shape[1]):
             variances[v, u] = 0
             if weights[v, u] == 0:
                 continue
-            z = np.float64(points_in_camera_mm[v, u, 2])
-            i, fi = _cell((points_in_camera_mm[v, u, 0] / z - lattice_low[0]) / lattice_step[0], a)
-            j, fj = _cell((points_in_camera_mm[v, u, 1] / z - lattice_low[1]) / lattice_step[1], b)
-            k, fk = _cell((z - lattice_low[2]) / lattice_step[2], c)
-            mean[:] = 0.0
-            for di in range(2):
-                for dj in range(2):
-                    share = (fi if di else 1.0 - fi) * (fj if dj else 1.0 - fj)
-                    near, far = share * (1.0 - fk), share * fk
-                    for entry in range(6):
-                        mean[entry] += near * covariances[i + di, j + dj, k, entry] + far * covariances[i + di, j + dj, k + 1, entry]
+            if u >= until:
+                until = u + taken_every
+                _interpolated(points_in_camera_mm[v, u], lattice_low, lattice_step, covariances, mean)
             nx, ny, nz = np.float64(normals[v, u, 0]), np.float64(normals[v, u, 1]), np.float64(normals[v, u, 2])
             if nx == 0.0 and ny == 0.0 and nz == 0.0:
                 eye = view.camera_in_base_mm

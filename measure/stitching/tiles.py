@@ -68,7 +68,7 @@ class Tiles:
         old = self._runs
         self._runs = []
         try:
-            self.write_run(_merged([self._opened(path) for path in old]))
+            self.write_run(_merged([_Run(path, self._words) for path in old]))
         except FileError:
             self._runs = old
             raise
@@ -78,12 +78,9 @@ class Tiles:
     def pieces(self, size: int) -> Iterator[IntArray]:
         """Rows (<= size, words) of the one run, in order."""
         for path in self._runs:
-            rows = self._opened(path)
-            for first in range(0, len(rows), size):
-                yield np.array(rows[first : first + size])
-
-    def _opened(self, path: Path) -> IntArray:
-        return np.memmap(path, dtype=np.int64, mode="r").reshape(-1, self._words)
+            run = _Run(path, self._words)
+            for first in range(0, len(run), size):
+                yield run.rows(first, size)
 
     def _new_path(self) -> Path:
         if self._folder is None:
@@ -93,14 +90,31 @@ class Tiles:
         return self._folder / f"{self._n_written:04d}.run"
 
 
-def _merged(runs: list[IntArray]) -> Iterator[IntArray]:
+class _Run:
+    """Rows of a file, read and not mapped: mapped pages would count as memory of ours."""
+
+    def __init__(self, path: Path, words: int) -> None:
+        self._path = path
+        self._words = words
+        self._n_rows = path.stat().st_size // (8 * words)
+
+    def __len__(self) -> int:
+        return self._n_rows
+
+    def rows(self, first: int, most: int) -> IntArray:
+        """Up to so many rows from one on."""
+        count = max(0, min(most, self._n_rows - first)) * self._words
+        return np.fromfile(self._path, dtype=np.int64, count=count, offset=8 * self._words * first).reshape(-1, self._words)
+
+
+def _merged(runs: list[_Run]) -> Iterator[IntArray]:
     """Rows of sorted runs in order, those of one voxel added up."""
     from measure import fuse_kernels as kernels
 
     step = max(1, _MERGED_AT_ONCE // len(runs))
     at = [0] * len(runs)
     while any(begin < len(run) for begin, run in zip(at, runs, strict=True)):
-        blocks = [np.array(run[begin : begin + step]) for begin, run in zip(at, runs, strict=True)]
+        blocks = [run.rows(begin, step) for begin, run in zip(at, runs, strict=True)]
         last = min(int(block[-1, kernels.KEY]) for block in blocks if len(block))
         taken = [int(np.searchsorted(block[:, kernels.KEY], last, side="right")) for block in blocks]
         rows = np.concatenate([block[:n] for block, n in zip(blocks, taken, strict=True)])
