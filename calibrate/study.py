@@ -24,6 +24,7 @@ from calibrate.study_cell import StudyNoise, paper_cell
 from calibrate.study_clouds import clouds_table, diameter_figure, fit_variants, stitching, table_5
 from calibrate.study_compare import comparison
 from calibrate.study_data import StudyFigure, StudyTable
+from calibrate.study_printed import printed_tables
 from calibrate.study_sweeps import camera_sweep, noise_sweep
 
 Progress = Callable[[int, int], None]
@@ -126,6 +127,7 @@ def _run(settings: StudySettings, progress: Progress) -> Study:
     steps.done()
     named = {table.name: table for table in tables}
     tables.insert(0, comparison(named["table3"], named["table5"], named["stitching"]))
+    tables += printed_tables(figures, tables, first.exact_tests.true_centre_in_camera_mm)
     return Study(s, tuple(tables), tuple(figures), time.perf_counter() - began)
 
 

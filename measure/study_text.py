@@ -24,7 +24,8 @@ class Section:
 SECTIONS = (
     Section(
         "Printed and computed, side by side",
-        "Every figure that the paper prints for its methods 1 to 4, and the same figure from this run.",
+        "Every figure that the paper prints for its methods 1 to 4, and the same figure from this run. What it prints about its plots "
+        "stands with each of them below; nothing was read off a plot.",
         tables=("comparison",),
     ),
     Section(
@@ -66,6 +67,7 @@ SECTIONS = (
         differ="The last link's twist and the hand-eye twist are one and the same displacement, and the base frame is free: what one part gives away "
         "another takes, and the block that comes first takes all. No data of this kind can say that the hand-eye transform alone was found, or "
         "the robot alone; only their sum is real.",
+        tables=("printed_figure6",),
         figures=("figure6",),
     ),
     Section(
@@ -73,7 +75,7 @@ SECTIONS = (
         "The paper's noise times a level, camera error zero.",
         agree="The spread of methods 1 and 2 stays far below that of method 3 and rises with the noise.",
         differ="Method 4's sensitivity to noise is its gauge: e_mean of the variant that leaves it open runs away, its spread is that of method 2.",
-        tables=("figure7",),
+        tables=("printed_figure7", "figure7"),
         figures=("figure7",),
     ),
     Section(
@@ -81,7 +83,7 @@ SECTIONS = (
         "The paper's k times a factor, no noise; the axis is the mean camera error at the sphere.",
         agree="A camera error that is left out (methods 2 and 4) spoils the calibration in proportion; method 1 takes it out.",
         differ="Where the lines of e_mean cross is a matter of the datum. The spread of methods 2 and 4 stays below that of method 3 throughout.",
-        tables=("figure8",),
+        tables=("printed_figure8", "figure8"),
         figures=("figure8",),
     ),
     Section(
@@ -100,6 +102,7 @@ SECTIONS = (
         differ="The paper's camera always reads large, by up to 0.4 mm, less so far away. With the simulated k a sphere reads small; with the other "
         "sign, which is that of the k found on hardware (Table 4), it reads large and falls with z, as in the paper's Fig 5. Method 1 fits k to "
         "centres of free-radius fits, which move with the bend, and overshoots: the paper too finds its deviation not completely eliminated.",
+        tables=("printed_figure5", "printed_figure11"),
         figures=("figure5", "figure11"),
     ),
     Section(
@@ -107,6 +110,7 @@ SECTIONS = (
         "How far robot, hand-eye and camera are moved at each noisy test.",
         differ="How a displacement is split between robot and hand-eye is decided by the gauge and by the order of the blocks; the paper itself "
         "calls the values a reference only.",
+        tables=("printed_figure10",),
         figures=("figure10",),
     ),
     Section(
@@ -139,6 +143,8 @@ SECTIONS = (
 
 HEADS: Mapping[str, str] = MappingProxyType(
     {
+        "printed": "paper prints",
+        "ours": "here",
         "printed_mm": "paper, mm",
         "ours_mm": "here, mm",
         "comparable": "can agree",

@@ -26,7 +26,8 @@ def number(cell: Cell) -> float:
 
 def test_every_table_and_figure_of_the_paper_is_there(study: Study) -> None:
     tables = {"comparison", "table3", "table5", "stitching", "figure7", "figure8", "gauge", "order", "guess_signs", "table3_clouds"}
-    assert {table.name for table in study.tables} == tables
+    printed = {f"printed_figure{number}" for number in (5, 6, 7, 8, 10, 11)}
+    assert {table.name for table in study.tables} == tables | printed
     figures = {"figure5", "figure6", "figure7", "figure8", "figure10", "figure11", "figure13", "figure14", "descent"}
     assert {figure.name for figure in study.figures} == figures
     for table in study.tables:
@@ -44,6 +45,23 @@ def test_printed_figures_stand_beside_ours(study: Study) -> None:
         assert printed[f"Table 5, method {method}, max"] == TABLE_5[method][1]
     assert all(row[3] in {"no", "in size"} and row[4] for row in study.table("comparison").rows)
     assert not any("Table 2" in str(row[0]) for row in study.table("comparison").rows)
+
+
+def test_what_the_paper_prints_about_its_plots_stands_beside_ours(study: Study) -> None:
+    """Printed figures as in the paper; ours are those of the curves."""
+    rows = {str(row[0]): row for n in (5, 6, 7, 8, 10, 11) for row in study.table(f"printed_figure{n}").rows}
+    assert all(row[3] in {"yes", "in size", "no"} and row[4] for row in rows.values())
+    added = rows["camera error added, largest, mm (6d; section 4.1)"]
+    camera = next(panel for panel in study.figure("figure6").panels if panel.title == "camera")
+    assert (added[1], added[2]) == (1.6, max(camera.curves[1].y))
+    before = rows["hand-eye error before, mm (6c; printed matrices)"]
+    assert number(before[1]) == pytest.approx(1.865, abs=1e-3)
+    assert number(before[2]) == pytest.approx(number(before[1]), abs=1e-9)
+    found = rows["hand-eye error left by method 1, mm (6c; printed matrices)"]
+    assert number(found[1]) == pytest.approx(0.218, abs=1e-3)
+    # Table 2's k leave next to nothing of the simulated error, which is what makes the lost exponents' signs right
+    assert number(rows["camera error left by method 1, largest, mm (6d; k of Table 2 at our places)"][1]) < 0.05
+    assert str(rows["with growing z (section 2.2)"][2]).startswith("decreases, by")
 
 
 def test_methods_rank_as_in_the_paper_by_spread(study: Study) -> None:
