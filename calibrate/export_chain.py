@@ -5,8 +5,8 @@
 with C the coupling of the model. It is `prod_i T_i(theta_i) exp(xi_i)` with RotZ(theta_i) = RotZ(offset_i) RotZ(C_i q) taken apart; RotZ
 and TransZ of one axis commute. The datum of the base is in origins[0], the last link's twist in origins[n].
 
-A robot that also yields under gravity is no such chain: the part of it that is constant over the seen axis ranges goes into the
-offsets of the axes, and the rest is the stated residual.
+A robot that also yields under gravity is no such chain: all six numbers of every origin are then fitted over the seen axis
+ranges, and what is left is the stated residual.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from calibrate.result import Calibration
 
 EXACT_MM = 1e-7
-_STEPS = 4
+_STEPS = 6
+_OPEN = 1e-9
+"""Part of the largest singular value below which a direction counts as open."""
 _N_FIT = 200
 
 
@@ -63,7 +65,7 @@ def rigid_chain(calibration: Calibration, what: str) -> RigidChain:
     origins[0] = calibration.datum.base_from_solver @ origins[0]
     residual = residual_of(calibration, lambda joints: _frames(model, origins, joints)[-1])
     if residual.arm_max_mm >= EXACT_MM:
-        origins = _with_constant_offsets(calibration, model, origins)
+        origins = _nearest(calibration, model, origins)
         residual = residual_of(calibration, lambda joints: _frames(model, origins, joints)[-1])
     return RigidChain(model, origins, residual)
 
@@ -78,16 +80,21 @@ def _frames(model: RobotModel, origins: FloatArray, joints_rad: FloatArray) -> l
     return frames
 
 
-def _with_constant_offsets(calibration: Calibration, model: RobotModel, origins: FloatArray) -> FloatArray:
-    """Origins with a constant offset of every axis that brings the chain nearest to the calibrated robot (Gauss-Newton)."""
+def _nearest(calibration: Calibration, model: RobotModel, origins: FloatArray) -> FloatArray:
+    """Origins, all free, that bring the chain nearest to the calibrated robot (Gauss-Newton).
+
+    Neighbouring origins can take a turn and a slide about their axis from each other, so the step is the shortest one in
+    mm and mrad: what the poses do not tell apart stays where it was.
+    """
     joints = seen_joints_rad(calibration, _N_FIT)
     target = corners(calibration.base_from_flange(joints))
+    unit = np.tile([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3], len(origins))
     result = origins.copy()
     for _ in range(_STEPS):
         frames = _frames(model, result, joints)
         points = corners(frames[-1])
-        axes = np.stack([se3.adjoint(frame)[:, :, 5] for frame in frames[:-1]], axis=1)
-        offsets = np.linalg.lstsq(point_rows(axes, points), (target - points).reshape(-1), rcond=None)[0]
-        rotation = se3.exp_so3(offsets[:, None] * np.array([0.0, 0.0, 1.0]))
-        result[:-1] = result[:-1] @ se3.from_rotation_translation(rotation, np.zeros(3))
+        # a right twist of an origin acts in the frame behind it
+        twists = np.concatenate([np.swapaxes(se3.adjoint(frame), 1, 2) for frame in frames], axis=1)
+        step = unit * np.linalg.lstsq(point_rows(twists, points) * unit, (target - points).reshape(-1), rcond=_OPEN)[0]
+        result = result @ se3.exp(step.reshape(-1, 6))
     return result
