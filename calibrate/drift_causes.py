@@ -19,9 +19,10 @@ from scipy.special import logsumexp
 from scipy.stats import f as f_distribution
 
 from calibrate.datum import term_columns
-from calibrate.problem import Problem, State, corrected_chain
+from calibrate.problem import Problem, State
 from calibrate.quick_check import CheckResiduals
-from drivers.kinematics import se3
+from calibrate.robot_terms import deflection_rad
+from drivers.kinematics import mdh, se3
 from drivers.kinematics.se3 import FloatArray
 
 HAND_EYE, CAMERA, SPHERE, SHOT = "hand-eye", "camera", "sphere moved", "single shot"
@@ -105,12 +106,14 @@ def causes_of(residuals: CheckResiduals, state: State, sphere_names: Sequence[st
 
 def axis_columns(problem: Problem, state: State) -> FloatArray:
     """(3 m, n) motion of the residuals per rad that a controller's reading of each axis is off; (3 m, 0) for pose-only data."""
-    if problem.model is None:
+    if problem.model is None or problem.joints_rad is None:
         return np.zeros((3 * problem.n_shots, 0))
     n = problem.model.n_joints
     load = np.broadcast_to(problem.model.coupling, (problem.n_shots, n, n))
     centres = state.centres_in_base_mm[problem.sphere]
-    return term_columns(state.link_twists, corrected_chain(problem, state), load, centres).reshape(3 * problem.n_shots, n)
+    deflection = deflection_rad(problem.terms, state.terms_rad, problem.model, problem.joints_rad)
+    frames = mdh.chain(problem.model, problem.joints_rad, state.link_twists, deflection)
+    return term_columns(state.link_twists, frames, load, centres).reshape(3 * problem.n_shots, n)
 
 
 def _camera(residuals: CheckResiduals) -> Cause:
