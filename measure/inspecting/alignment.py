@@ -15,7 +15,7 @@ from measure.inspecting.features import PartCloud
 from measure.inspecting.fitting import PatchSums, Response, patch_covariance, patches_of
 from measure.inspecting.geometry import Element
 
-_THINNED = 20_000
+_THINNED = 8_000
 _ROUNDS = 60
 _CELLS_ACROSS = 8
 _FIRST_LIMIT = 0.1
@@ -23,7 +23,9 @@ _FIRST_LIMIT = 0.1
 _SMALLEST_LIMIT_MM = 0.5
 _SCALES = 4.0
 _SETTLED_MM = 1e-4
-_LEAST_OVERLAP = 0.25
+_LEAST_OVERLAP, _PLAINLY_RIGHT = 0.25, 0.9
+_LEAST_HOLD = 1e-3
+"""Mean square of the normals' share in the least held motion, turns taken at the part's radius."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +58,7 @@ def best_fit(surface: NominalSurface, cloud: PartCloud) -> BestFit:
         tried = _iterate(surface, points, start)
         if found is None or tried[1] < found[1]:
             found = tried
-        if found[2] >= 2 * _LEAST_OVERLAP:
+        if found[2] >= _PLAINLY_RIGHT:
             break
     if found is None or found[2] < _LEAST_OVERLAP:
         overlap = 0.0 if found is None else found[2]
@@ -96,7 +98,7 @@ def _step(nearest: FloatArray, normal: FloatArray, residual: FloatArray, weight:
 
 def _finished(surface: NominalSurface, cloud: PartCloud, transform: FloatArray) -> BestFit:
     """The last fit, by plain least squares of all points that belong to the part; and how well it is known."""
-    stride = max(1, len(cloud.points_mm) // (5 * _THINNED))
+    stride = max(1, len(cloud.points_mm) // (12 * _THINNED))
     for _ in range(3):
         points = se3.apply(transform, cloud.points_mm[::stride])
         near = surface.nearest(points)
@@ -115,7 +117,7 @@ def _finished(surface: NominalSurface, cloud: PartCloud, transform: FloatArray) 
     patches = PatchSums(labels, np.ones(len(labels)))
     by_patch = patches.total((gain[:, :, None] * normal[:, None, :]).reshape(len(gain), -1)).reshape(-1, 6, 3)
     response = Response(patches.mean(used), by_patch, size_mm, gain.sum(axis=0))
-    covariance = patch_covariance(gain, residual, patches)
+    covariance = patch_covariance(gain, residual, used)
     return BestFit(transform, covariance, response, float(np.sqrt(np.mean(residual**2))), int(kept.sum()), len(points))
 
 
@@ -123,7 +125,7 @@ def _require_held(jacobian: FloatArray, arms: FloatArray) -> None:
     """All six motions must meet resistance."""
     reach = max(float(np.sqrt(np.mean(np.sum(arms**2, axis=1)))), 1e-9)
     scaled = jacobian / np.array([1, 1, 1, reach, reach, reach])
-    if np.linalg.eigvalsh(scaled.T @ scaled / len(scaled))[0] < 1e-5:
+    if np.linalg.eigvalsh(scaled.T @ scaled / len(scaled))[0] < _LEAST_HOLD:
         raise DataError(
             "the points leave the part free to slide or turn on its nominal",
             remedy="Scan more sides of it, or align by datum features, or as measured.",

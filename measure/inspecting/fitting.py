@@ -33,6 +33,8 @@ _VOXELS = 0.5
 _SMALLEST_SCALE_MM = 1e-5
 _LONGEST_STEP_MM = 0.5
 _CELLS_ACROSS = 6
+_COARSE_CELLS_ACROSS = 3
+_LEAST_FREEDOM = 3
 _FEWEST_PER_PARAMETER = 5
 _LARGEST_TURN_RAD = 0.15
 _LOOK = "Look at alignment, nominal and search_mm, and whether the scans show the place."
@@ -186,7 +188,7 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     return Fit(
         shape=shape,
         params=params,
-        covariance=patch_covariance(gain, found.residual_mm, patches),
+        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm),
         response=response,
         rms_mm=float(np.sqrt(np.average(found.residual_mm**2, weights=points.weights))),
         rows=points.rows,
@@ -229,15 +231,26 @@ def patches_of(points_mm: FloatArray, cells_across: int = _CELLS_ACROSS) -> tupl
     return (np.cumsum(taken) - 1)[keys], size
 
 
-def patch_covariance(gain: FloatArray, residual_mm: FloatArray, patches: PatchSums) -> FloatArray:
-    """(p, p) of parameters that answer to residuals (n,) by gains (n, p)."""
+def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray) -> FloatArray:
+    """(p, p) of parameters that answer to residuals (n,) at points (n, 3) by gains (n, p).
+
+    Patches of two sizes, since nobody knows how far neighbours have errors in common: each variance is the larger one.
+    """
+    scores = gain * residual_mm[:, None]
+    fine, coarse = (_by_patches(scores, patches_of(points_mm, cells)[0]) for cells in (_CELLS_ACROSS, _COARSE_CELLS_ACROSS))
+    if fine is None:  # too few patches to tell anything
+        fine = scores.T @ scores * max(1.0, len(scores) / _CELLS_ACROSS)
+    larger = np.ones(len(fine)) if coarse is None else np.sqrt(np.maximum(np.diag(coarse) / np.maximum(np.diag(fine), 1e-300), 1.0))
+    return np.asarray(fine * np.outer(larger, larger))
+
+
+def _by_patches(scores: FloatArray, labels: IntArray) -> FloatArray | None:
+    """The patches' sums of squares with Student's factor; None where there are too few patches."""
     from scipy.special import stdtrit
 
-    n, p = gain.shape
-    scores = patches.total(gain * residual_mm[:, None])
-    n_patches = len(scores)
-    if n_patches <= p + 2:  # too few to tell: every point by itself, and one patch's worth of doubt
-        return np.asarray((gain * residual_mm[:, None] ** 2).T @ gain * max(1.0, n / max(n_patches, 1)))
-    freedom = n_patches - p
+    sums = PatchSums(labels, np.ones(len(labels))).total(scores)
+    freedom = len(sums) - scores.shape[1]
+    if freedom < _LEAST_FREEDOM:
+        return None
     student = float(stdtrit(freedom, 0.975)) / 1.959964
-    return np.asarray(scores.T @ scores * (n_patches / freedom) * student**2)
+    return np.asarray(sums.T @ sums * (len(sums) / freedom) * student**2)

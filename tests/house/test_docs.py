@@ -10,6 +10,7 @@ import pytest
 from acquire.cell import load_cell
 from drivers.files.shots import read_shots
 from drivers.models import parse_robot_model
+from measure.inspecting.spec import load_spec
 from tests.support.source import ROOT
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "THIRD_PARTY.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -74,3 +75,9 @@ def test_the_shot_of_the_page_loads(tmp_path: Path) -> None:
     (tmp_path / "shots.jsonl").write_text(line, encoding="utf-8")
     (shot,) = read_shots(tmp_path)
     assert shot.sphere == "A"
+
+
+def test_the_inspection_file_of_the_page_loads(tmp_path: Path) -> None:
+    path = tmp_path / "inspection.yaml"
+    path.write_text(example("yaml", "spherecal-inspection/1"), encoding="utf-8")
+    assert len(load_spec(path).features) == 6
