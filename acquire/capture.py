@@ -43,7 +43,7 @@ from acquire.identity import reopen_camera, reopen_robot
 from acquire.motion import RobotUnsettled, halt, read_safely
 from acquire.plan import Plan, PlannedPose
 from acquire.session import SessionWriter
-from acquire.way import Way
+from acquire.way import way_of
 from drivers.errors import CameraError, CameraTimeout, MotionRefused, RobotError, RobotNotReached, SettingsError, SpherecalError
 from drivers.kinematics.mdh import RobotModel
 from drivers.protocols import Devices, Robot
@@ -68,7 +68,8 @@ def run_capture(
         model: the nominal robot, to predict where a sphere will be seen; the cell's if None.
 
     Raises:
-        RobotError: the robot is late, stands elsewhere, is in a safety stop or gone (it was stopped as far as possible).
+        RobotError: the robot is late, stands elsewhere, is in a safety stop or gone (it was stopped as far as possible), or no
+            clear way leads from where it stands to the next pose.
         CameraError: the camera is gone, set wrongly, or failed at several poses in a row.
         DataError: a sphere was missed several times in a row, or the camera's temperature drifts.
         FileError: the session cannot be written.
@@ -127,7 +128,7 @@ class _Run:
         self._planned = frozenset(self._poses)
         self._queue = deque(pose for pose in plan.poses if not self._book.is_done(pose))
         self._n_begun = len(plan.poses) - len(self._queue)
-        self._way = Way(plan.poses)
+        self._way = way_of(cell, model, plan.poses)
         self._taker = PoseTaker(devices, cell, model, self._way, self._book, self._vigil, settings, self._tell)
         self._state = RunState.READY
         self._is_located, self._is_cold = False, settings.warm_up is not None

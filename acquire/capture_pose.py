@@ -98,7 +98,7 @@ class PoseTaker:
 
     def _go(self, pose: PlannedPose, motion: MotionSettings) -> Steps:
         begin = last = read_safely(self._robot)
-        for target in self._way.to(pose):
+        for target in self._way.to(pose, begin.joints_rad):
             self._note_approach(last, target)
             for state in move(self._robot, target, motion):
                 last = state

@@ -7,11 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from acquire.candidates import CandidatePool
 from drivers.errors import SettingsError
+from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
 # What a full range of each group counts for: the camera volume carries scale and camera error, the rest robot and hand-eye.
 _WEIGHT_IN_CAMERA, _WEIGHT_DIRECTION, _WEIGHT_ROLL, _WEIGHT_JOINTS = 1.0, 0.7, 0.4, 0.7
 _MOST_SWEEPS = 30
+# Kept from the limits by axes whose turn is chosen here.
+_LIMIT_MARGIN_RAD = float(np.radians(2))
 
 
 def choose_spread(pool: CandidatePool, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -41,21 +44,57 @@ def choose_spread(pool: CandidatePool, n: int, rng: np.random.Generator) -> NDAr
     return np.array(chosen, dtype=np.intp)
 
 
-def order_by_travel(joints_rad: ArrayLike, *, start_joints_rad: ArrayLike | None = None) -> NDArray[np.intp]:
+def order_by_travel(
+    joints_rad: ArrayLike,
+    *,
+    start_joints_rad: ArrayLike | None = None,
+    extra_rad: FloatArray | None = None,
+    extra_from_start_rad: FloatArray | None = None,
+) -> NDArray[np.intp]:
     """An order (k,) of axis angles (k, n) with little travel: nearest neighbour, then 2-opt; a step costs its largest axis motion.
 
-    The first pose is the one nearest to `start_joints_rad`, or an end of the tour where that is None.
+    The first pose is the one nearest to `start_joints_rad`, or an end of the tour where that is None. `extra_rad` (k, k),
+    symmetric, and `extra_from_start_rad` (k,) are what steps cost besides, e.g. where something is in the way.
     """
     joints = np.asarray(joints_rad, dtype=np.float64)
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    cost = np.abs(joints[:, None] - joints[None]).max(axis=-1)
+    cost = np.abs(joints[:, None] - joints[None]).max(axis=-1) + (0.0 if extra_rad is None else extra_rad)
     if start_joints_rad is None:
         to_start, first = np.zeros(len(joints)), np.argmax(cost.sum(axis=0))
     else:
         to_start = np.abs(joints - np.asarray(start_joints_rad)).max(axis=-1)
+        to_start = to_start + (0.0 if extra_from_start_rad is None else extra_from_start_rad)
         first = np.argmin(to_start)
     return _two_opt(_nearest_neighbour(cost, int(first)), cost, to_start)
+
+
+def unwound(model: RobotModel, joints_rad: FloatArray) -> FloatArray:
+    """Axis angles (k, n), each axis in the turns that leave its largest unused arc between the first and the last.
+
+    Where an axis can make more than a turn, an arc that no pose uses is often one that none can pass: a wrist that would run
+    into its forearm. Axes that are coupled to others, or have no room for it within their limits, stay as they are.
+    """
+    result = joints_rad.copy()
+    for axis in np.flatnonzero([_turns_alone(model, axis) for axis in range(model.n_joints)]):
+        angles = np.mod(joints_rad[:, axis], 2 * np.pi)
+        rising = np.sort(angles)
+        begin = float(np.roll(rising, -1)[np.argmax(np.diff(rising, append=rising[:1] + 2 * np.pi))])
+        angles = begin + np.mod(angles - begin, 2 * np.pi)
+        low, high = model.joint_limits_rad[axis]
+        middle = 0.5 * (low + high) if np.isfinite(high - low) else 0.0
+        angles = angles + 2 * np.pi * round((middle - 0.5 * float(angles.min() + angles.max())) / (2 * np.pi))
+        if low + _LIMIT_MARGIN_RAD <= angles.min() and angles.max() <= high - _LIMIT_MARGIN_RAD:
+            result[:, axis] = angles
+    return result
+
+
+def _turns_alone(model: RobotModel, axis: int) -> bool:
+    """Whether a whole turn of an axis leaves the arm where it is, and is within its limits."""
+    unit = np.eye(model.n_joints)[axis]
+    alone = (model.coupling[axis] == unit).all() and (model.coupling[:, axis] == unit).all()
+    low, high = model.joint_limits_rad[axis]
+    return bool(alone and high - low > 2 * np.pi and not any(limit.row[axis] for limit in model.linear_limits))
 
 
 def travel_rad(joints_rad: ArrayLike) -> float:

@@ -16,15 +16,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from acquire.candidates import Blocked
 from acquire.cell import Cell, robot_model_of
-from acquire.collision import cell_collisions
+from acquire.collision import CollisionCheck, cell_collisions
 from acquire.exposure import Exposure, expose
 from acquire.motion import MotionSettings, Stillness, halt, move, read_safely, settle
 from acquire.plan import PlannedPose
 from acquire.sighting import base_from_flange_of, look_for, predicted_centre_in_camera_mm
 from acquire.sphere import ArcFinding, SphereFinding, SphereNotFound, SphereSettings
-from acquire.sweep import way_between
+from acquire.sweep import swept_ways
 from acquire.teach_events import Finish, Guide, Jog, Looked, NextSphere, Record, Recorded, Taught, TeachCommand, TeachEvent, Told, Via
 from drivers.errors import CameraTimeout, InvalidFrame, MotionRefused, SafetyStop, SettingsError
 from drivers.kinematics.mdh import RobotModel, within_limits
@@ -89,7 +88,7 @@ class _Lesson:
     def __init__(self, devices: Devices, cell: Cell, settings: TeachSettings, model: RobotModel | None) -> None:
         self._robot, self._camera = devices.robot, devices.camera
         self._cell, self._settings, self._model = cell, settings, model
-        self._blocked: Blocked | None = None if model is None else cell_collisions(cell, model)
+        self._blocked: CollisionCheck | None = None if model is None else cell_collisions(cell, model)
         self._guided = False
         self._chosen = settings.sphere_name
         if self._chosen is not None and self._chosen not in cell.spheres:
@@ -240,9 +239,9 @@ class _Lesson:
 
     def _touches(self, pose: PlannedPose) -> bool:
         """Whether the straight lines in axis angles from the pose before, which a run drives, touch something known."""
-        if self._blocked is None or not self._poses:
+        if self._blocked is None:
             return False
-        return bool(self._blocked(way_between(self._poses[-1], pose)).any())
+        return any(way.touches.any() for way in swept_ways([*self._poses[-1:], pose], self._blocked)[-1:])
 
     def _undo(self) -> TeachEvent:
         if self._via:

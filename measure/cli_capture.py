@@ -59,6 +59,9 @@ def capture(
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the poses and the time they take; touch nothing.")] = False,
     step: Annotated[bool, typer.Option("--step", help="Ask before every pose.")] = False,
+    touching: Annotated[
+        bool, typer.Option("--touching", help="Run it step by step although, by rough shapes, a way touches what the cell file knows.")
+    ] = False,
     speed: Annotated[
         float | None, typer.Option(min=0.001, metavar="RAD_S", help="No axis faster than this; never faster than the cell says.")
     ] = None,
@@ -79,6 +82,7 @@ def capture(
     with command(as_json, debug, quiet) as run:
         from acquire.cell import load_cell, robot_model_of
         from acquire.plan import load_plan
+        from drivers.errors import FileError
 
         loaded = load_cell(cell)
         poses = load_plan(plan, loaded, robot_model_of(loaded))
@@ -87,7 +91,15 @@ def capture(
             run.finish(_dry_run(run.console, loaded, poses, settings))
             return
         _check_extend(loaded, until_length_u, extend)
-        how = how_to_run(loaded, poses, settings, yes=yes, step=step)
+        touches = _touches(loaded, poses)
+        if touches and not touching:
+            more = f", and {len(touches) - 1} more" if len(touches) > 1 else ""
+            raise FileError(
+                f"{touches[0]}{more}",
+                file=plan,
+                remedy="Look at it with `spherecal preview`; plan again, or give points to pass (via_rad). Are the rough shapes wrong? --touching",
+            )
+        how = how_to_run(loaded, poses, settings, yes=yes, step=step or bool(touches))
         if how.note:
             run.console.note(how.note)
         result, interrupts = _captured(run, loaded, poses, out, how, Extras(until_length_u, extend, view), resume=resume)
@@ -105,6 +117,14 @@ def _settings(cell: Cell, speed_rad_s: float | None, warm_up: bool) -> CaptureSe
     settings = settings_of(cell)
     motion = settings.motion if speed_rad_s is None else replace(settings.motion, speed_rad_s=min(speed_rad_s, settings.motion.speed_rad_s))
     return replace(settings, motion=motion, warm_up=WarmUpSettings() if warm_up else None)
+
+
+def _touches(cell: Cell, plan: Plan) -> list[str]:
+    """What is wrong with the ways of a plan, which may have been edited, or its cell."""
+    from acquire.cell import robot_model_of
+    from acquire.sweep import touching_ways, way_text
+
+    return [way_text(way) for way in touching_ways(plan.poses, cell, robot_model_of(cell))]
 
 
 def _check_extend(cell: Cell, until_length_u_mm: float | None, extend: int) -> None:
@@ -183,9 +203,13 @@ def _dry_run(console: Console, cell: Cell, plan: Plan, settings: CaptureSettings
     seconds, speed = planned_seconds(plan.poses, settings), settings.motion.speed_rad_s
     console.table("", ["pose", "sphere", "axes, degrees"], rows)
     console.say(f"{len(plan.poses)} poses, about {seconds / 60:.0f} min at {speed:g} rad/s; nothing was moved")
+    touches = _touches(cell, plan)
+    for text in touches:
+        console.say(text)
     if left := _never_driven(cell, plan, settings):
         console.say(f"{len(left)} of the poses were never driven in this cell: their first run goes step by step at {_first_speed(settings):g} rad/s")
-    return {"n_shots": 0, "n_failed": 0, "state": "dry_run", "n_poses": len(plan.poses), "seconds": seconds, "never_driven": list(left)}
+    counts = {"n_shots": 0, "n_failed": 0, "state": "dry_run", "n_poses": len(plan.poses), "seconds": seconds}
+    return {**counts, "never_driven": list(left), "touching": touches}
 
 
 def how_to_run(cell: Cell, plan: Plan, settings: CaptureSettings, *, yes: bool, step: bool) -> How:

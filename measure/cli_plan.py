@@ -39,6 +39,9 @@ def plan(
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box in the base, mm, for --for workpiece; the work volume if left out."),
     ] = None,
+    start_deg: Annotated[
+        str | None, typer.Option("--start", metavar="Q1,Q2,...", help="Where the robot stands before the run, axis angles in degrees.")
+    ] = None,
     calibration: EarlierCalibration = None,
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws other poses.")] = 0,
     as_json: AsJson = False,
@@ -77,6 +80,15 @@ def _check_plan(cell: Path, calibration: Path | None, spheres: list[str], n: int
     return plan_check(load_cell(cell), Calibration.load(calibration), spheres, n or N_POSES, seed)
 
 
+def _angles(text: str) -> list[float]:
+    from drivers.errors import SettingsError
+
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise SettingsError(f"{text!r} are no axis angles", where="--start", remedy="Give them in degrees, e.g. 0,-90,90,0,45,0.") from error
+
+
 def _expectation(calibration: Path | None) -> Expectation | None:
     from calibrate import Calibration
     from calibrate.design_cell import expectation_of
@@ -87,7 +99,9 @@ def _expectation(calibration: Path | None) -> Expectation | None:
 def _tell(console: Console, result: PlanResult, out: Path) -> None:
     rows = [[f"rejected: {reason}", count] for reason, count in sorted(result.rejected.items())]
     console.table("", ["candidates", "views"], [["drawn", result.n_candidates], *rows, ["feasible", result.n_feasible]])
-    console.say(f"{len(result.plan.poses)} poses in {out}")
+    vias = sum(len(pose.via_rad) for pose in result.plan.poses) - result.n_one_sided
+    around = f", {vias} points to pass round what stands in the way" if vias else ""
+    console.say(f"{len(result.plan.poses)} poses in {out}, {result.n_one_sided} reached from the same side{around}")
     length_mm, centre_mm = (result.plan.predicted.get(key) for key in ("length_rms_mm", "centre_rms_mm"))
     if length_mm is not None:
         centre = "" if centre_mm is None else f", centre of one view {centre_mm:.3f} mm"

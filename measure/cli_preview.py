@@ -26,10 +26,11 @@ def preview(
     with command(as_json, debug, quiet) as run:
         from acquire.cell import load_cell, robot_model_of
         from acquire.plan import load_plan
+        from acquire.sweep import way_text
         from drivers.errors import FileError, SettingsError
         from measure.cli_report import open_viewer
         from measure.files import require_writable
-        from measure.plan_scene import preview_of, way_text
+        from measure.plan_scene import preview_of
         from measure.viewer import write_recording
 
         target = plan.with_suffix(".rrd") if out is None else out

@@ -12,7 +12,7 @@ from acquire.cell import Cell
 from acquire.collision import cell_collisions
 from acquire.obstacles import BoxObstacle, CylinderObstacle, MeshObstacle, Obstacle
 from acquire.plan import Plan
-from acquire.sweep import SweptWay, swept_ways
+from acquire.sweep import SweptWay, swept_ways, way_text
 from drivers.errors import FileError
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
@@ -110,15 +110,6 @@ def _solid(obstacle: Obstacle, cell: Cell) -> SolidMark:
 
 def _aim(way: SweptWay) -> str:
     return "no sphere" if way.pose.sphere is None else f"sphere {way.pose.sphere}"
-
-
-def way_text(way: SweptWay) -> str:
-    """Which way touches something, and where."""
-    if way.before is None:
-        return f"pose {way.pose.id} touches something"
-    if len(way.joints_rad) and way.touches[-1]:
-        return f"pose {way.pose.id} itself touches something"
-    return f"the way from {way.before.id} to {way.pose.id} touches something"
 
 
 def _summary(plan: Plan, cell: Cell, ways: Sequence[SweptWay], seconds: float) -> str:

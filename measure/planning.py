@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from acquire.cell import Cell, robot_model_of
-from acquire.collision import cell_collisions
-from acquire.ordering import choose_spread, order_by_travel
+from acquire.collision import CollisionCheck, cell_collisions
+from acquire.ordering import choose_spread, unwound
 from acquire.plan import Plan, PlannedPose
 from acquire.poses import DEFAULT_LAW, CandidatePool, sphere_candidates, workpiece_poses
+from acquire.routing import route
 from acquire.visibility import CameraView, camera_view
 from drivers.errors import DataError, SettingsError
-from drivers.kinematics.mdh import RobotModel
+from drivers.kinematics.mdh import RobotModel, within_limits
 from drivers.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ CANDIDATES_PER_POSE = 12
 FEWEST_CANDIDATES = 200
 MOST_DESIGNED_FROM = 1500
 """Candidates that the design looks at: more make it slower and hardly better."""
+NO_WAY = "no way"
+"""Of a chosen pose to which no clear way was found."""
 _NOTE = "one sigma, first order; unmodelled physics of usual size is included, a damaged robot or camera is not"
 
 # Plans for different purposes are drawn from different streams: a verification that repeats the poses of the
@@ -50,6 +53,8 @@ class PlanSettings:
     region_mm: FloatArray | None = None
     """(2, 3) box in the base that workpiece poses cover; the cell's work volume if None."""
     seed: int = 0
+    start_rad: FloatArray | None = None
+    """(n,) where the robot stands before the run; None if nobody knows."""
     expectation: Expectation | None = None
     """What shots are like, e.g. of an earlier calibration; stated defaults if None. For calibrations."""
 
@@ -62,6 +67,8 @@ class PlanResult:
     n_candidates: int
     n_feasible: int
     rejected: Mapping[str, int] = field(default_factory=dict)
+    n_one_sided: int = 0
+    """Poses that are reached by turning every axis forwards."""
 
     def to_json_dict(self) -> Mapping[str, object]:
         """What `spherecal plan --json` prints; predictions are null but for calibrations."""
@@ -69,7 +76,8 @@ class PlanResult:
             "n_candidates": self.n_candidates,
             "n_feasible": self.n_feasible,
             "rejected": self.rejected,
-            "poses": [{"id": pose.id, "sphere": pose.sphere, "joints_rad": pose.joints_rad} for pose in self.plan.poses],
+            "poses": [{"id": p.id, "sphere": p.sphere, "joints_rad": p.joints_rad, "via_rad": p.via_rad} for p in self.plan.poses],
+            "n_one_sided": self.n_one_sided,
             "predicted": {"centre_rms_mm": None, "length_rms_mm": None} | dict(self.plan.predicted),
         }
 
@@ -83,19 +91,20 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
         FileError: the robot model is missing or broken.
     """
     model, flange_from_camera = needed_of(cell)
+    _check_start(settings.start_rad, model)
     rng = np.random.default_rng([settings.seed, _STREAM[settings.purpose]])
-    view = camera_view(cell.camera)
+    view, check = camera_view(cell.camera), cell_collisions(cell, model)
     pools: list[tuple[str | None, CandidatePool]] = []
     if settings.purpose == "workpiece":
-        pools.append((None, _workpiece_pool(cell, settings, model, flange_from_camera, view, rng)))
+        pools.append((None, _workpiece_pool(cell, settings, model, flange_from_camera, view, check, rng)))
     else:
         spheres = _spheres(cell, settings.spheres)
         for name, n in zip(spheres, _shared_out(settings.n_poses, len(spheres)), strict=True):
-            pool = _sphere_pool(cell, name, n, model, flange_from_camera, view, rng)
+            pool = _sphere_pool(cell, name, n, model, flange_from_camera, view, check, rng)
             pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng))))
     if settings.purpose == "calibration":
-        return _result(cell, settings.purpose, *_designed(cell, model, pools, settings, rng))
-    return _result(cell, settings.purpose, pools)
+        return _result(cell, settings, model, check, *_designed(cell, model, pools, settings, rng))
+    return _result(cell, settings, model, check, pools)
 
 
 def _designed(
@@ -120,18 +129,27 @@ def _designed(
 
 
 def _result(
-    cell: Cell, purpose: Purpose, pools: Sequence[tuple[str | None, CandidatePool]], predicted: Mapping[str, object] | None = None
+    cell: Cell,
+    settings: PlanSettings,
+    model: RobotModel,
+    check: CollisionCheck,
+    pools: Sequence[tuple[str | None, CandidatePool]],
+    predicted: Mapping[str, object] | None = None,
 ) -> PlanResult:
     names = [name for name, pool in pools for _ in pool.view]
-    joints = np.concatenate([pool.joints_rad for _, pool in pools])
-    order = order_by_travel(joints)
-    poses = tuple(PlannedPose(f"{i:03d}", names[row], joints[row].round(6)) for i, row in enumerate(order, start=1))
+    joints = unwound(model, np.concatenate([pool.joints_rad for _, pool in pools])).round(6)
+    ways = route(model, check, joints, start_rad=settings.start_rad)
+    poses = tuple(
+        PlannedPose(f"{i:03d}", names[row], joints[row], vias) for i, (row, vias) in enumerate(zip(ways.rows, ways.via_rad, strict=True), start=1)
+    )
     rejected: Counter[str] = Counter()
     for _, pool in pools:
         rejected.update(pool.rejected)
+    if ways.lost:
+        rejected[NO_WAY] += len(ways.lost)
     n_candidates = sum(pool.n_candidates for _, pool in pools)
-    plan = Plan(cell.sha256, purpose, poses, dict(predicted or {}))
-    return PlanResult(plan, n_candidates, n_candidates - rejected.total(), dict(rejected))
+    plan = Plan(cell.sha256, settings.purpose, poses, dict(predicted or {}))
+    return PlanResult(plan, n_candidates, n_candidates - rejected.total(), dict(rejected), ways.n_one_sided)
 
 
 def needed_of(cell: Cell) -> tuple[RobotModel, FloatArray]:
@@ -143,6 +161,13 @@ def needed_of(cell: Cell) -> tuple[RobotModel, FloatArray]:
         remedy = "Give a first guess, from a drawing: a few mm and degrees are near enough."
         raise SettingsError("poses cannot be planned without a hand-eye guess", file=cell.path, where="flange_from_camera", remedy=remedy)
     return model, np.asarray(cell.flange_from_camera, dtype=np.float64)
+
+
+def _check_start(start_rad: FloatArray | None, model: RobotModel) -> None:
+    if start_rad is None or (len(start_rad) == model.n_joints and within_limits(model, start_rad)):
+        return
+    remedy = f"Give {model.n_joints} axis angles, as the controller shows them."
+    raise SettingsError(f"the start is no pose of {model.name}: its axes or their limits differ", where="--start", remedy=remedy)
 
 
 def _spheres(cell: Cell, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -165,7 +190,14 @@ def _shared_out(n: int, among: int) -> list[int]:
 
 
 def _sphere_pool(
-    cell: Cell, name: str, n: int, model: RobotModel, flange_from_camera: FloatArray, view: CameraView, rng: np.random.Generator
+    cell: Cell,
+    name: str,
+    n: int,
+    model: RobotModel,
+    flange_from_camera: FloatArray,
+    view: CameraView,
+    check: CollisionCheck,
+    rng: np.random.Generator,
 ) -> CandidatePool:
     sphere = cell.spheres[name]
     others = [(o.centre_in_base_mm, o.radius_mm) for key, o in cell.spheres.items() if key != name and o.centre_in_base_mm is not None]
@@ -178,7 +210,7 @@ def _sphere_pool(
         max(FEWEST_CANDIDATES, CANDIDATES_PER_POSE * n),
         rng,
         other_spheres=[(np.asarray(centre), radius) for centre, radius in others],
-        blocked=cell_collisions(cell, model),
+        blocked=check,
     )
     if pool.n_feasible < n:
         reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
@@ -192,14 +224,20 @@ def _sphere_pool(
 
 
 def _workpiece_pool(
-    cell: Cell, settings: PlanSettings, model: RobotModel, flange_from_camera: FloatArray, view: CameraView, rng: np.random.Generator
+    cell: Cell,
+    settings: PlanSettings,
+    model: RobotModel,
+    flange_from_camera: FloatArray,
+    view: CameraView,
+    check: CollisionCheck,
+    rng: np.random.Generator,
 ) -> CandidatePool:
     region = settings.region_mm if settings.region_mm is not None else cell.work_volume_box_mm
     if region is None:
         remedy = "Give --region X0 Y0 Z0 X1 Y1 Z1, or work_volume_mm in the cell file."
         raise SettingsError("no region to cover is known", file=cell.path, where="work_volume_mm", remedy=remedy)
-    law, blocked = replace(DEFAULT_LAW, largest_tilt_rad=0.6), cell_collisions(cell, model)
-    pool = workpiece_poses(model, flange_from_camera, view, region, settings.n_poses, rng, law=law, blocked=blocked)
+    law = replace(DEFAULT_LAW, largest_tilt_rad=0.6)
+    pool = workpiece_poses(model, flange_from_camera, view, region, settings.n_poses, rng, law=law, blocked=check)
     if len(pool.view) == 0:
         reasons = ", ".join(f"{reason} {count}" for reason, count in pool.rejected.items())
         remedy = "Name a region within the robot's reach."

@@ -35,7 +35,6 @@ FEWEST_SHOTS = 12
 _SOLVED_FROM = 6
 _AS_PREDICTED = 2.0
 """Left-out shots may miss by this many times what was predicted before a prediction is no longer believed."""
-_PATH_STEP_RAD = 0.02
 _CLOSE_S = 1.0
 
 
@@ -168,19 +167,13 @@ def _taken(cell: Cell, session: Session, calibration: Calibration) -> Taken:
 
 
 def _further(cell: Cell, model: RobotModel, taken: Taken, begin_rad: FloatArray, number: int) -> tuple[PlannedPose, ...]:
-    """Poses beyond the plan; the straight way to them is looked at closely, since nobody planned one."""
+    """Poses beyond the plan that a straight and clear way leads to from where the robot stands."""
     from acquire.collision import cell_collisions
     from calibrate.next_poses import next_best_poses
 
-    blocked, names = cell_collisions(cell, model), (f"extra{number:03d}{letter}" for letter in "abcdefgh")
-    poses = [pose for pose in next_best_poses(cell, model, taken) if not blocked(straight_way(begin_rad, pose.joints_rad)).any()]
+    check, names = cell_collisions(cell, model), (f"extra{number:03d}{letter}" for letter in "abcdefgh")
+    poses = [pose for pose in next_best_poses(cell, model, taken) if check.trouble(begin_rad, pose.joints_rad) is None]
     return tuple(replace(pose, id=name) for pose, name in zip(poses, names, strict=False))
-
-
-def straight_way(begin_rad: FloatArray, end_rad: FloatArray) -> FloatArray:
-    """(k, n) axis angles of a straight motion, no axis further than 0.02 rad from one to the next."""
-    n = max(2, 1 + int(np.ceil(np.abs(end_rad - begin_rad).max() / _PATH_STEP_RAD)))
-    return np.asarray(begin_rad + np.linspace(0, 1, n)[:, None] * (end_rad - begin_rad))
 
 
 class SolveWorker:

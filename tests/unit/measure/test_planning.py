@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from acquire.cell import Cell, load_cell, robot_model_of
-from acquire.plan import load_plan
+from acquire.collision import cell_collisions
+from acquire.plan import Plan, PlannedPose, load_plan, write_plan
+from acquire.sweep import touching_ways
 from drivers.errors import SettingsError
 from drivers.kinematics import mdh, se3
 from measure.cli import app
 from measure.cli_run import run_app
 from measure.demo_cell import TABLE_TOP_MM, true_centres_in_base_mm, write_demo_cell
-from measure.planning import PlanSettings, make_plan
+from measure.planning import NO_WAY, PlanSettings, make_plan
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,38 @@ def test_every_pose_sees_its_sphere(cell: Cell) -> None:
         assert abs(x) < z * np.tan(np.radians(27.5))
         assert abs(y) < z * np.tan(np.radians(18))
         assert base_from_camera[2, 3] > TABLE_TOP_MM
+
+
+def test_what_a_plan_drives_is_clear_one_sided_and_begins_where_the_robot_stands(cell: Cell) -> None:
+    model = robot_model_of(cell)
+    assert model is not None
+    start = np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
+    result = make_plan(cell, PlanSettings("verification", n_poses=10, start_rad=start))
+    poses = result.plan.poses
+    assert touching_ways([PlannedPose("start", None, start), *poses], cell, model) == ()
+    assert len(poses) == 10 - result.rejected.get(NO_WAY, 0)
+    assert result.n_one_sided >= 8
+    assert sum(bool(pose.via_rad) and bool((pose.joints_rad > pose.via_rad[-1]).all()) for pose in poses) >= 8
+    assert result.n_candidates == result.n_feasible + sum(result.rejected.values())
+
+
+def test_an_edited_plan_is_refused_by_capture_where_it_touches_something(cell: Cell, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    poses = make_plan(cell, PlanSettings("verification", n_poses=10)).plan.poses
+    model = robot_model_of(cell)
+    assert model is not None
+    lower = poses[0].joints_rad + np.linspace(-1, 1, 41)[:, None] * np.eye(6)[1]
+    lower = lower[mdh.within_limits(model, lower)]
+    into_table = lower[np.argmax(cell_collisions(cell, model)(lower))]
+    edited = Plan(cell.sha256, "verification", (poses[0], PlannedPose("low", None, into_table), *poses[1:]))
+    write_plan(edited, tmp_path / "plan.yaml")
+    arguments = ["capture", str(cell.path), str(tmp_path / "plan.yaml"), "-o", str(tmp_path / "session"), "--yes", "--json"]
+    assert run_app(app, arguments) == 1
+    error = json.loads(capfd.readouterr().out)["error"]
+    assert "low itself touches something" in error["message"]
+    assert "--touching" in error["remedy"]
+    assert not (tmp_path / "session").exists()
+    assert run_app(app, [*arguments, "--dry-run"]) == 0
+    assert "pose low itself touches something" in json.loads(capfd.readouterr().out)["touching"]
 
 
 def test_the_seed_makes_the_plan_and_purposes_differ(cell: Cell) -> None:

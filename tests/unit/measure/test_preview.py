@@ -15,13 +15,13 @@ from rerun.chunk import RrdReader
 from acquire.cell import Cell, load_cell, robot_model_of
 from acquire.collision import cell_collisions
 from acquire.plan import Plan, PlannedPose, write_plan
-from acquire.sweep import STEP_RAD, swept_ways, way_between
+from acquire.sweep import STEP_RAD, swept_ways, way_between, way_text
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import mdh
 from drivers.kinematics.se3 import FloatArray
 from measure.cli import app
 from measure.cli_run import run_app
-from measure.plan_scene import preview_of, way_text
+from measure.plan_scene import preview_of
 from measure.viewer import write_recording
 from measure.viewer_surroundings import pieces_of
 

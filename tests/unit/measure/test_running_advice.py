@@ -18,7 +18,7 @@ from drivers.files.shots import Shot
 from drivers.kinematics.mdh import base_from_flange
 from measure.demo_cell import write_demo_cell
 from measure.running_advice import Advice, Wanted
-from measure.running_solve import FEWEST_SHOTS, Question, Solved, SolveWorker, straight_way
+from measure.running_solve import FEWEST_SHOTS, Question, Solved, SolveWorker
 from measure.running_view import Feed, View, scene_of_run
 from tests.support.fake_devices import fake_plan
 
@@ -97,12 +97,6 @@ def test_without_a_target_nothing_is_commanded() -> None:
     advice = Advice(Fake(solved(0.01, best="p2")), Path("s"), PLAN, Wanted(), shown.append)
     assert [advice.command_at(event) for event in events_of()] == [None] * 6
     assert "pose p2 would tell most" in shown[0][1]
-
-
-def test_a_straight_way_has_no_gaps() -> None:
-    way = straight_way(np.array([0.0, 1.0]), np.array([1.0, -1.0]))
-    np.testing.assert_allclose(way[[0, -1]], [[0, 1], [1, -1]])
-    assert np.abs(np.diff(way, axis=0)).max() <= 0.02 + 1e-9
 
 
 def test_the_solver_answers_and_its_death_is_told_once(tmp_path: Path) -> None:
