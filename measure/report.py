@@ -16,6 +16,7 @@ from drivers.files.disk import write_text_atomic
 from drivers.kinematics.se3 import FloatArray
 from measure import plots
 from measure.plots import AFTER_COLOUR, LengthBar, ShotSeries
+from measure.proof.tables import proof_tables
 from measure.report_facts import facts_of
 from measure.report_insight import budget_pictures, budget_tables, field_pictures, field_tables, identifiability_tables
 from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual, Table
@@ -97,7 +98,7 @@ def page_of(facts: CalibrationFacts, verification: VerifyResult | None, moment: 
         rows=result_rows(facts, verification),
         reasons=facts.reasons if verification is None else verification.reasons,
         next_steps=next_steps_of(facts, verification),
-        tables=(*tables_of(facts, verification), *_insight_tables(facts)),
+        tables=(*tables_of(facts, verification), *(() if verification is None else proof_tables(verification)), *_insight_tables(facts)),
         pictures=tuple(_pictures(facts, verification)),
         calibration_rows=calibration_rows(facts),
         identity=identity_of(facts, verification),

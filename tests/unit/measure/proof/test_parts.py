@@ -16,6 +16,7 @@ from drivers.files.session import Session, read_session
 from drivers.kinematics.se3 import FloatArray
 from measure.proof.probing import probing_of
 from measure.proof.scatter import OwnCentre, agreed_variance, scatter_scale, student_factor
+from measure.proof.tables import proof_tables
 from measure.proof.volume import volume_lines
 from measure.sphere_figures import SphereFigures, SphereSize, figures_of
 from measure.verify import verify
@@ -96,6 +97,12 @@ def test_a_slide_is_paired_view_by_view_with_another_pose(tmp_path: Path) -> Non
     assert slide.pairs.mean_mm == pytest.approx(np.abs(expected).mean())
     assert slide.pairs.signed_mean_mm == pytest.approx(expected.mean())
     assert slide.pairs.std_mm == pytest.approx(np.abs(expected).std())
+    # the page shows them, and the paper's figure with why the two may differ
+    (table,) = [table for table in proof_tables(result) if table.title.startswith("Slide")]
+    assert [row[0] for row in table.rows] == ["A0-A50", "paper, method 1"]
+    assert table.rows[0][2] == f"{np.abs(expected).mean():.4f}"
+    assert "0.1232" in table.rows[1][2]
+    assert "may differ" in table.lead
 
 
 def test_a_slide_whose_ends_share_their_poses_is_refused(tmp_path: Path) -> None:
@@ -131,7 +138,7 @@ def test_lines_through_a_volume_reach_its_corners_and_middles() -> None:
     lines = volume_lines(box)
     lengths = np.linalg.norm(lines[:, 1:] - lines[:, :1], axis=2)
     assert lines.shape == (7, 6, 3)
-    assert np.allclose(np.sort(lengths[:, -1]), [120, 300, 400, *([np.linalg.norm([400, 300, 120])] * 4)])
+    assert np.allclose(np.sort(lengths[:, -1]), np.append([120.0, 300.0, 400.0], np.full(4, np.linalg.norm([400, 300, 120]))))
     corners = {tuple(place) for line in lines[:4] for place in (line[0], line[-1])}
     assert len(corners) == 8
     assert np.allclose(np.diff(lengths, axis=1), lengths[:, :1])

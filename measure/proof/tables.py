@@ -1,0 +1,62 @@
+"""The proof's tables on a report page: probing error, slides, and shots beyond the calibrated reach."""
+
+from __future__ import annotations
+
+from measure.proof.probing import Probing
+from measure.proof.slide import CAUTION, slide_rows
+from measure.report_page import Table
+from measure.verify_result import VerifyResult
+
+_NOTHING = "–"
+
+
+def proof_tables(result: VerifyResult) -> tuple[Table, ...]:
+    """Those that have anything to say."""
+    return tuple(table for table in (_probing(result), _slides(result), _outside(result)) if table.rows)
+
+
+def _probing(result: VerifyResult) -> Table:
+    rows = []
+    for name in result.figures.spheres:
+        members = [p for p in result.probing if p.sphere == name and p.probing is not None]
+        rows += [(name, "all views", *_figures(p.probing)) for p in members if p.session is None]
+        rows += [(name, f"{result.session_name(p.session)}, shot {p.index}", *_figures(p.probing)) for p in members if p.session is not None]
+    return Table(
+        "Probing error of form and size",
+        "Free-radius fits. Form: the thinnest shell about the centre that holds all points, 99.7 % or 95 % of them; size: fitted diameter of those "
+        "points minus the certified one. All views stitched first, then every view by itself, where no robot error comes in. mm.",
+        ("sphere", "of", "points", "form, all", "99.7 %", "95 %", "size, all", "99.7 %", "95 %"),
+        tuple(rows),
+    )
+
+
+def _figures(probing: Probing | None) -> tuple[str, ...]:
+    if probing is None:
+        return (_NOTHING,) * 7
+    return (str(probing.n_points), *(f"{form:.3f}" for form in probing.form_mm), *(f"{size:+.3f}" for size in probing.size_error_mm))
+
+
+def _slides(result: VerifyResult) -> Table:
+    rows = [tuple(_text(cell) for cell in row) for row in slide_rows(result.slides)]
+    return Table(
+        "Slide test, view by view",
+        f"| |P1 - P2| - L | of single views of both ends, no two of a pair from the same robot pose. {CAUTION}",
+        ("slide", "pairs", "mean, mm", "max, mm", "std, mm", "signed mean, mm", "refused"),
+        tuple(rows),
+    )
+
+
+def _text(cell: object) -> str:
+    if cell is None:
+        return _NOTHING
+    return f"{cell:.4f}" if isinstance(cell, float) else str(cell)
+
+
+def _outside(result: VerifyResult) -> Table:
+    return Table(
+        "Shots beyond what the calibration saw",
+        "Used all the same: there the calibration continues what it found elsewhere, and its U says little.",
+        ("session", "shot", "sphere", "what"),
+        tuple((result.session_name(shot.session), str(shot.index), shot.sphere, "; ".join(shot.what)) for shot in result.outside),
+        numeric=False,
+    )
