@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drivers.errors import DataError, SettingsError
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, Shot, read_scan
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
 from measure.fuse import DEFAULT_MEMORY_MB, FusedCloud, VoxelGrid
 from measure.placing import check_fits
 from measure.stitching.outputs import CloudLabel, check_suffix, read_fused, write_cloud
+from measure.stitching.refine import Refinement, ScanSurface, refine, require_registration, surface_of
 from measure.stitching.scan import DEFAULT_CLEANING, NO_CLEANING, Cleaning, StitchingSystem, prepare_scan, unit_variance_mm2
 
 Progress = Callable[[int, int], None]
@@ -35,6 +38,8 @@ class StitchSettings:
     """Budget of the voxel table; beyond it the table goes to disk, beside the output."""
     n_threads: int | None = None
     """Scans worked on at a time; as many as there are processors if None. It changes no bit of the result."""
+    refine: bool = False
+    """Also register the scans to each other, and write that cloud beside the unrefined one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +83,9 @@ class StitchResult:
     seconds: float
     marks: tuple[str, ...] = ()
     """How robot and camera differ from those that were calibrated, where the cell file lets that pass."""
+    refinement: Refinement | None = None
+    refined_out: Path | None = None
+    """The refined cloud, where one was asked for and any scans overlap."""
 
     @property
     def n_points_in(self) -> int:
@@ -118,17 +126,42 @@ class StitchResult:
             "calibration": self.calibration_id,
             "session": self.session_digest,
             "marks": list(self.marks),
+            "refinement": None if self.refinement is None else self.refinement.to_json_dict(),
+            "refined_out": None if self.refined_out is None else str(self.refined_out),
         }
 
 
 class Stitcher:
     """Scans in, one cloud out: for those who have the scans before the session is closed, such as an in-line measurement."""
 
-    def __init__(self, calibration: StitchingSystem, session: Session, settings: StitchSettings, *, spill_folder: Path | None = None) -> None:
-        """An empty cloud; SettingsError for a voxel size or budget that is no positive number."""
+    def __init__(
+        self,
+        calibration: StitchingSystem,
+        session: Session,
+        settings: StitchSettings,
+        *,
+        spill_folder: Path | None = None,
+        motions: Mapping[int, FloatArray] | None = None,
+    ) -> None:
+        """An empty cloud.
+
+        Args:
+            calibration: what moves points from the camera to the base.
+            session: that the shots belong to.
+            settings: how to stitch.
+            spill_folder: where the table goes beyond its memory.
+            motions: (4, 4) by index of the shot, applied in the base after the calibration: a refinement's.
+
+        Raises:
+            SettingsError: a voxel size or budget that is no positive number.
+        """
         self._calibration = calibration
         self._session = session
         self._cleaning = settings.cleaning
+        self._collects = settings.refine
+        self._motions: Mapping[int, FloatArray] = motions or {}
+        self.surfaces: list[ScanSurface] = []
+        """What registration needs of each scan, where it was asked for."""
         unit = unit_variance_mm2(calibration.noise)
         self.grid = VoxelGrid(
             settings.voxel_mm, full=settings.full, unit_variance_mm2=unit, memory_mb=settings.memory_mb, spill_folder=spill_folder
@@ -142,8 +175,14 @@ class Stitcher:
         """
         full = self.grid.full
         scan = prepare_scan(self._calibration, self._session, shot, cloud, self._cleaning, full=full)
+        if self._collects:
+            self.surfaces.append(surface_of(shot, cloud.points_mm, scan))
+        points = scan.points_in_base_mm
+        if shot.index in self._motions:
+            # normals stay: they turn by less than a thousandth
+            points = se3.apply(self._motions[shot.index], points.reshape(-1, 3)).reshape(points.shape)
         added = self.grid.add(
-            scan.points_in_base_mm, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None
+            points, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None
         )
         empty = () if scan.n_valid else (shot.index,)
         return ScanCounts(scan.n_valid, scan.n_edge, scan.n_grazing, scan.n_speck, added.n_outside, empty)
@@ -185,6 +224,8 @@ def stitch(
     chosen = settings or StitchSettings(voxel_mm, DEFAULT_CLEANING if clean_edges else NO_CLEANING, min_count)
     target = Path(out)
     check_suffix(target)
+    if chosen.refine:
+        require_registration()
     stitcher = Stitcher(calibration, session, chosen, spill_folder=target.parent)
     marks = check_fits(calibration, session)
     shots = scans_once(session)
@@ -197,6 +238,7 @@ def stitch(
     _require_points(n_points, session, counts)
     label = cloud_label(calibration, session, chosen, len(shots))
     write_cloud(target, stitcher.grid.pieces(min_count=chosen.min_count), n_points, label)
+    refinement, refined_out = _refined(calibration, session, chosen, stitcher.surfaces, target, shots) if chosen.refine else (None, None)
     return StitchResult(
         out=target,
         n_scans=len(shots),
@@ -208,7 +250,30 @@ def stitch(
         session_digest=session.digest,
         seconds=time.perf_counter() - began,
         marks=marks,
+        refinement=refinement,
+        refined_out=refined_out,
     )
+
+
+def _refined(
+    calibration: StitchingSystem,
+    session: Session,
+    settings: StitchSettings,
+    surfaces: Sequence[ScanSurface],
+    unrefined: Path,
+    shots: Sequence[Shot],
+) -> tuple[Refinement, Path | None]:
+    """Register the scans and write the cloud that they make then, beside the unrefined one."""
+    found = refine(calibration, surfaces)
+    if not found.n_pairs:
+        return found, None
+    stitcher = Stitcher(calibration, session, replace(settings, refine=False), spill_folder=unrefined.parent, motions=found.motions)
+    for _ in _fused_scans(stitcher, session, shots, settings.n_threads):
+        pass
+    out = unrefined.with_name(f"{unrefined.stem}.refined{unrefined.suffix}")
+    label = cloud_label(calibration, session, settings, len(shots), "refined by registration")
+    write_cloud(out, stitcher.grid.pieces(min_count=settings.min_count), stitcher.grid.n_fused(min_count=settings.min_count), label)
+    return found, out
 
 
 def scans_once(session: Session) -> tuple[Shot, ...]:
@@ -226,7 +291,7 @@ def scans_once(session: Session) -> tuple[Shot, ...]:
     return tuple(first_of_scan.values())
 
 
-def cloud_label(calibration: StitchingSystem, session: Session, settings: StitchSettings, n_scans: int) -> CloudLabel:
+def cloud_label(calibration: StitchingSystem, session: Session, settings: StitchSettings, n_scans: int, *further: str) -> CloudLabel:
     """What the file says of a cloud."""
     comments = (
         "unit mm",
@@ -236,6 +301,7 @@ def cloud_label(calibration: StitchingSystem, session: Session, settings: Stitch
         f"voxel_mm {settings.voxel_mm:g}",
         f"scans {n_scans}",
         "uncertainty is standard (k = 1), mm, along the normal",
+        *further,
     )
     return CloudLabel(comments, f"base frame, calibration {calibration.id[:12]}")
 

@@ -1,0 +1,242 @@
+"""Refinement by registration: small motions of the scans that make them agree, as far as the calibration believes possible.
+
+Every scan may move by a small rigid motion about the middle of the surface, x_s = (translation there in mm, rotation in
+rad). What is believed of all of them beforehand is one Gaussian: the calibration's covariance, which moves scans of like
+poses alike, and the pose noise of each scan. Overlapping scans are registered in pairs by GICP (Segal, Haehnel, Thrun
+2009; library small_gicp); a pair tells x_source - x_target, with the information that its surface holds (a plane tells
+nothing of sliding along it). The pose graph is linear, and its solution is the mean of that Gaussian given the pairs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import SettingsError
+from drivers.files.session import Shot
+from drivers.kinematics import se3
+from drivers.kinematics.se3 import FloatArray
+from measure.fuse import VoxelGrid
+from measure.stitching.scan import PreparedScan, StitchingSystem
+
+VOXEL_MM = 1.5
+"""Of the clouds that are registered."""
+_OVERLAP_VOXEL_MM = 6.0
+_LEAST_OVERLAP = 0.3
+_PAIRS_PER_SCAN = 4
+_LEAST_POINTS = 200
+_REACH_MM = 3.0
+_BOUND = 27.9
+"""Of the squared Mahalanobis distance of a scan's motion: 99.99 % of a Gaussian in six dimensions."""
+_LEVERS_MM = np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [0.0, 40.0, 0.0], [0.0, 0.0, 40.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanSurface:
+    """What registration needs of a scan."""
+
+    shot: Shot
+    points_in_base_mm: FloatArray
+    """(n, 3) one a voxel."""
+    normals: FloatArray
+    """(n, 3)."""
+    middle_in_camera_mm: FloatArray
+    """(3,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """Small motions of the scans, and what they are worth."""
+
+    motions: Mapping[int, FloatArray]
+    """(4, 4) by index of the shot: refined_base_from_base."""
+    shift_mm: Mapping[int, float]
+    """How far each scan's middle moves."""
+    bounded: tuple[int, ...]
+    """Shots whose motion was cut back to what the calibration believes possible."""
+    n_pairs: int
+    disagreement_before_mm: float
+    """Rms distance, along the normals, between the scans of all pairs."""
+    disagreement_after_mm: float
+
+    def to_json_dict(self) -> dict[str, object]:
+        """For `--json`."""
+        return {
+            "n_pairs": self.n_pairs,
+            "disagreement_before_mm": _finite(self.disagreement_before_mm),
+            "disagreement_after_mm": _finite(self.disagreement_after_mm),
+            "shift_mm": {str(index): shift for index, shift in self.shift_mm.items()},
+            "bounded": list(self.bounded),
+        }
+
+
+def require_registration() -> Any:
+    """The registration library.
+
+    Raises:
+        SettingsError: it is not installed.
+    """
+    try:
+        import small_gicp
+    except ImportError as error:
+        what = "refinement needs the library small_gicp, which is not installed"
+        raise SettingsError(what, remedy="pip install 'spherecal[registration]', or stitch without refinement.") from error
+    return small_gicp
+
+
+def surface_of(shot: Shot, xyz_in_camera_mm: FloatArray, scan: PreparedScan) -> ScanSurface:
+    """The points that are registered: means of coarse voxels with a normal."""
+    grid = VoxelGrid(VOXEL_MM)
+    grid.add(scan.points_in_base_mm, weights=scan.weights, normals=scan.normals)
+    fused = grid.fused()
+    kept = np.isfinite(fused.normals).all(axis=1)
+    used = xyz_in_camera_mm.reshape(-1, 3)[scan.weights.reshape(-1) > 0]
+    middle = used.mean(axis=0, dtype=np.float64) if len(used) else np.array([0.0, 0.0, 1.0])
+    return ScanSurface(shot, fused.points_mm[kept], fused.normals[kept].astype(np.float64), np.asarray(middle, dtype=np.float64))
+
+
+def refine(system: StitchingSystem, surfaces: Sequence[ScanSurface]) -> Refinement:
+    """Find the motions.
+
+    Args:
+        system: whose covariance and noise say what is possible.
+        surfaces: of all scans, in any order.
+
+    Raises:
+        SettingsError: the registration library is not installed.
+    """
+    library = require_registration()
+    scans = sorted((s for s in surfaces if len(s.points_in_base_mm) >= _LEAST_POINTS), key=lambda s: s.shot.index)
+    if len(scans) < 2:
+        return Refinement({}, {}, (), 0, float("nan"), float("nan"))
+    centre = np.mean([s.points_in_base_mm.mean(axis=0) for s in scans], axis=0)
+    prior = _prior(system, scans, centre)
+    pairs = _overlapping(scans)
+    information, gradient = np.zeros_like(prior), np.zeros(len(prior))
+    matched = []
+    for target, source in pairs:
+        twist, weight, match = _registered(library, system, scans[target], scans[source], centre)
+        matched.append((target, source, *match))
+        a, b = slice(6 * target, 6 * target + 6), slice(6 * source, 6 * source + 6)
+        for one, sign_one in ((a, -1.0), (b, 1.0)):
+            gradient[one] += sign_one * weight @ twist
+            for other, sign_other in ((a, -1.0), (b, 1.0)):
+                information[one, other] += sign_one * sign_other * weight
+    solved = prior @ np.linalg.solve(np.eye(len(prior)) + information @ prior, gradient)
+    motions, bounded = _bounded(solved.reshape(-1, 6), prior)
+    still = np.zeros_like(motions)
+    return Refinement(
+        motions={s.shot.index: _matrix(motion, centre) for s, motion in zip(scans, motions, strict=True)},
+        shift_mm={s.shot.index: _shift_mm(s, motion, centre) for s, motion in zip(scans, motions, strict=True)},
+        bounded=tuple(scans[i].shot.index for i in np.flatnonzero(bounded)),
+        n_pairs=len(pairs),
+        disagreement_before_mm=_disagreement_mm(scans, matched, still, centre),
+        disagreement_after_mm=_disagreement_mm(scans, matched, motions, centre),
+    )
+
+
+def _prior(system: StitchingSystem, scans: Sequence[ScanSurface], centre: FloatArray) -> FloatArray:
+    """(6 m, 6 m) covariance of the motions about the middle of the surface."""
+    shares, noises = [], []
+    for scan in scans:
+        pose = {"base_from_flange": scan.shot.base_from_flange} if system.model is None else {"joints_rad": scan.shot.joints_rad}
+        nodes = scan.middle_in_camera_mm + _LEVERS_MM
+        places = system.points_in_base_mm(nodes, **pose)
+        moved = system.point_jacobian(nodes, **pose)
+        design = np.concatenate([np.broadcast_to(np.eye(3), (4, 3, 3)), -se3.hat(places - centre)], axis=-1).reshape(12, 6)
+        shares.append(np.linalg.lstsq(design * _SCALE, moved.reshape(12, -1), rcond=None)[0] * _SCALE[:, None])
+        flange = np.asarray(scan.shot.base_from_flange if system.model is None else system.base_from_flange(np.asarray(scan.shot.joints_rad)))
+        at_centre = np.eye(6)
+        at_centre[:3, 3:] = -se3.hat(centre - flange[:3, 3])
+        noise = system.noise
+        noises.append(at_centre @ np.diag([noise.pose_mm**2] * 3 + [noise.pose_rad**2] * 3) @ at_centre.T)
+    share = np.concatenate(shares)
+    used = system.covariance[: share.shape[1], : share.shape[1]]
+    result = share @ used @ share.T
+    for i, block in enumerate(noises):
+        result[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += block
+    return np.asarray(result)
+
+
+_SCALE = np.array([1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2])
+
+
+def _overlapping(scans: Sequence[ScanSurface]) -> list[tuple[int, int]]:
+    """Pairs of scans that share surface, for each scan those that share most."""
+    cells = [set(map(tuple, np.floor(s.points_in_base_mm / _OVERLAP_VOXEL_MM).astype(np.int64).tolist())) for s in scans]
+    shared = {
+        (i, j): len(cells[i] & cells[j]) / min(len(cells[i]), len(cells[j])) for i, j in itertools.combinations(range(len(scans)), 2)
+    }
+    chosen: set[tuple[int, int]] = set()
+    for i in range(len(scans)):
+        mine = sorted((pair for pair in shared if i in pair and shared[pair] >= _LEAST_OVERLAP), key=lambda pair: (-shared[pair], pair))
+        chosen.update(mine[:_PAIRS_PER_SCAN])
+    return sorted(chosen)
+
+
+def _registered(
+    library: Any, system: StitchingSystem, target: ScanSurface, source: ScanSurface, centre: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+    """The motion (6,) that brings the source to the target, its information (6, 6), and matched rows of source and target."""
+    from scipy.spatial import cKDTree
+
+    shifted = [np.ascontiguousarray(s.points_in_base_mm - centre) for s in (target, source)]
+    found = library.align(
+        *shifted, registration_type="GICP", downsampling_resolution=VOXEL_MM / 2, max_correspondence_distance=_REACH_MM,
+        max_iterations=40, rotation_epsilon=1e-6, translation_epsilon=1e-5,
+    )  # fmt: skip
+    moved = np.asarray(found.T_target_source)
+    # about the centre, which is the origin here, a small motion is its translation and rotation vector
+    twist = np.concatenate([moved[:3, 3], se3.log_so3(moved[:3, :3])])
+    distance, row = cKDTree(shifted[0]).query(se3.apply(moved, shifted[1]), distance_upper_bound=_REACH_MM)
+    rows = np.flatnonzero(np.isfinite(distance))
+    rows = rows[(source.normals[rows] * target.normals[row[rows]]).sum(axis=1) > 0.8]
+    normals = source.normals[rows]
+    lever = np.concatenate([normals, np.cross(shifted[1][rows], normals)], axis=1)
+    n = np.array([max(len(rows), 1.0)])
+    weight = system.noise.point_weight(n)[0] / 2.0
+    return twist, np.asarray(weight * lever.T @ lever), (rows, row[rows])
+
+
+def _bounded(motions: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Motions (m, 6) cut back to what is believed possible of each, and which ones were."""
+    bounded = np.zeros(len(motions), dtype=np.bool_)
+    result = motions.copy()
+    for i, motion in enumerate(motions):
+        own = prior[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] / np.outer(_SCALE, _SCALE)
+        scaled = motion / _SCALE
+        distance2 = float(scaled @ np.linalg.pinv(own, hermitian=True) @ scaled)
+        if distance2 > _BOUND:
+            bounded[i] = True
+            result[i] *= np.sqrt(_BOUND / distance2)
+    return result, bounded
+
+
+def _matrix(motion: FloatArray, centre: FloatArray) -> FloatArray:
+    rotation = se3.exp_so3(motion[3:])
+    return se3.from_rotation_translation(rotation, centre + motion[:3] - rotation @ centre)
+
+
+def _shift_mm(scan: ScanSurface, motion: FloatArray, centre: FloatArray) -> float:
+    middle = scan.points_in_base_mm.mean(axis=0) - centre
+    return float(np.linalg.norm(motion[:3] + np.cross(motion[3:], middle)))
+
+
+def _disagreement_mm(
+    scans: Sequence[ScanSurface], matched: Sequence[tuple[int, int, FloatArray, FloatArray]], motions: FloatArray, centre: FloatArray
+) -> float:
+    squares, n = 0.0, 0
+    for target, source, rows, others in matched:
+        one = se3.apply(_matrix(motions[source], centre), scans[source].points_in_base_mm[rows])
+        other = se3.apply(_matrix(motions[target], centre), scans[target].points_in_base_mm[others])
+        along = ((one - other) * scans[target].normals[others]).sum(axis=1)
+        squares, n = squares + float(along @ along), n + len(along)
+    return float(np.sqrt(squares / n)) if n else float("nan")
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
