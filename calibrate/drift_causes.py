@@ -172,6 +172,8 @@ class Explanation:
     """Chi-square of the residuals that is left after it."""
     amplitudes: dict[str, tuple[float, float]]
     """Estimate and standard uncertainty of each change of its likeliest shape: of the thing itself, a camera's as the error it now has."""
+    alone: dict[str, tuple[float, float]]
+    """The same of its first and simplest shape, whatever is likeliest: what can be followed from check to check."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,11 +209,11 @@ def diagnose(residuals: CheckResiduals, causes: Sequence[Cause]) -> Diagnosis:
         best = max(range(len(shapes)), key=lambda i: shapes[i][0])
         evidence = float(logsumexp([s[0] for s in shapes], b=np.array([shape.weight for shape in cause.shapes]) / len(cause.shapes)))
         p_values.append(min(_chance(explained, k, noise_freedom) for _, explained, k, _ in shapes) * len(shapes) / share)
-        weighed.append((cause, evidence + np.log(cause.prior), shapes[best]))
-    log_total = float(logsumexp([evidence for _, evidence, _ in weighed]))
+        weighed.append((cause, evidence + np.log(cause.prior), shapes[best], shapes[0][3]))
+    log_total = float(logsumexp([evidence for _, evidence, _, _ in weighed]))
     explanations = [
-        Explanation(cause.name, float(np.exp(evidence - log_total)), explained, k, total - explained, amplitudes)
-        for cause, evidence, (_, explained, k, amplitudes) in weighed
+        Explanation(cause.name, float(np.exp(evidence - log_total)), explained, k, total - explained, amplitudes, alone)
+        for cause, evidence, (_, explained, k, amplitudes), alone in weighed
     ]
     explanations.sort(key=lambda e: -e.probability)
     prior = sum(cause.prior for cause in causes)

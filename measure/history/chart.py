@@ -57,7 +57,7 @@ def _point(row: ResultRow) -> ChartPoint:
 def _amounts(causes: object) -> dict[str, tuple[float, float]]:
     found: dict[str, tuple[float, float]] = {}
     for cause in causes if isinstance(causes, list) else []:
-        amplitudes = cause.get("amplitudes", {}) if isinstance(cause, dict) else {}
+        amplitudes = cause.get("alone", cause.get("amplitudes", {})) if isinstance(cause, dict) else {}
         pairs = {name: (_number(a.get("value")), _number(a.get("standard_uncertainty"))) for name, a in amplitudes.items() if isinstance(a, dict)}
         name = str(cause.get("cause"))
         if name == "single shot":
@@ -107,7 +107,17 @@ def chart_page(
         activations=activations,
         check_every_h=check_every_h,
         software=software,
+        tone={"conform": "good", "reject": "bad"}.get(points[-1].verdict if points else "", "unsure"),
+        headline=_headline(points),
     )
+
+
+def _headline(points: Sequence[ChartPoint]) -> str:
+    if not points:
+        return "Never checked"
+    last = points[-1]
+    what = f", changed: {last.named}" if last.named else ""
+    return f"Last quick check {last.taken_utc[:10]}: {last.verdict.replace('_', ' ')}{what}"
 
 
 def chart_svg(points: Sequence[ChartPoint], activations: Sequence[ActivationRow] = ()) -> str:
@@ -129,7 +139,7 @@ def chart_svg(points: Sequence[ChartPoint], activations: Sequence[ActivationRow]
                 panel.axvline(moment(activation.at_utc), color="#6b7280", linewidth=0.8, linestyle=":")
         panels[2].tick_params(axis="x", rotation=20)
 
-    return svg_of(draw, salt="history", size=(7.2, 7.4))
+    return svg_of(draw, salt="history", size=(9.0, 7.6))
 
 
 def _levels(panel: Any, times: Sequence[Any], points: Sequence[ChartPoint]) -> None:

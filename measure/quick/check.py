@@ -95,7 +95,8 @@ class CheckResult:
                     "probability": e.probability,
                     "chi_square_explained": e.chi_square,
                     "freedom": e.freedom,
-                    "amplitudes": {name: {"value": v, "standard_uncertainty": u} for name, (v, u) in e.amplitudes.items()},
+                    "amplitudes": _pairs_json(e.amplitudes),
+                    "alone": _pairs_json(e.alone),
                 }
                 for e in self.diagnosis.explanations
             ],
@@ -191,6 +192,10 @@ def _amount(name: str, value: float, sigma: float) -> str:
     if name.endswith("_rad"):
         return f"{name.removesuffix('_rad')} {1e3 * value:+.3f} +- {1e3 * sigma:.3f} mrad"
     return f"{name.removesuffix('_mm')} {value:+.3f} +- {sigma:.3f} mm"
+
+
+def _pairs_json(pairs: Mapping[str, tuple[float, float]]) -> dict[str, object]:
+    return {name: {"value": value, "standard_uncertainty": sigma} for name, (value, sigma) in pairs.items()}
 
 
 def _told_shots(residuals: CheckResiduals, shots: Sequence[SphereShot]) -> tuple[CheckShot, ...]:
