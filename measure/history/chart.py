@@ -57,7 +57,8 @@ def _point(row: ResultRow) -> ChartPoint:
 def _amounts(causes: object) -> dict[str, tuple[float, float]]:
     found: dict[str, tuple[float, float]] = {}
     for cause in causes if isinstance(causes, list) else []:
-        amplitudes = cause.get("alone", cause.get("amplitudes", {})) if isinstance(cause, dict) else {}
+        told = cause.get("alone", cause.get("amplitudes")) if isinstance(cause, dict) else None
+        amplitudes = told if isinstance(told, dict) else {}
         pairs = {name: (_number(a.get("value")), _number(a.get("standard_uncertainty"))) for name, a in amplitudes.items() if isinstance(a, dict)}
         name = str(cause.get("cause"))
         if name == "single shot":
