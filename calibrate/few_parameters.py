@@ -83,11 +83,11 @@ def resolve(
         residuals = check_residuals(current, shots)
         state = known_state(current, residuals.problem.n_scans)
         columns, names = unknowns_of(cause, residuals.problem, state, tuple(parent.sphere_centres_in_base_mm))
-        step = -_gain(residuals, columns, names) @ residuals.residual_mm.reshape(-1)
+        step = -gain(residuals, columns, _prior(names)) @ residuals.residual_mm.reshape(-1)
         moved = step if not len(moved) else moved + step
         current = _moved(current, residuals.problem, state, columns, step, cause)
     before = check_residuals(parent, shots)
-    covariance, sigma = _covariance(parent, before, columns, names)
+    covariance, sigma = moved_covariance(parent, before, columns, _prior(names))
     errors = _left_out(before, columns, names)
     own = np.linalg.norm(before.residual_mm, axis=1)
     new = replace(
@@ -166,13 +166,20 @@ def _prior(names: Sequence[str]) -> FloatArray:
     return np.array([_PRIOR_RAD if name.endswith("_rad") else _PRIOR_MM for name in names])
 
 
-def _gain(residuals: CheckResiduals, columns: FloatArray, names: Sequence[str], keep: NDArray[np.int64] | None = None) -> FloatArray:
-    """(k, r) estimate of the amplitudes per residual, from rows (r,) to keep or all; its minus is the change."""
+def gain(residuals: CheckResiduals, columns: FloatArray, prior: FloatArray, keep: NDArray[np.int64] | None = None) -> FloatArray:
+    """(k, r) estimate of the amplitudes per residual, from rows (r,) to keep or all; its minus is the change.
+
+    Args:
+        residuals: of the parent calibration.
+        columns: (P, k) how the unknowns follow the amplitudes.
+        prior: (k,) sizes that they may have.
+        keep: rows of the residuals.
+    """
     size = 3 * residuals.n_shots
     rows = np.arange(size) if keep is None else keep
-    effect = (residuals.sensitivity.reshape(size, -1) @ columns)[rows] * _prior(names)
+    effect = (residuals.sensitivity.reshape(size, -1) @ columns)[rows] * prior
     total = effect @ effect.T + residuals.covariance_mm2[np.ix_(rows, rows)]
-    return np.asarray(_prior(names)[:, None] * np.linalg.solve(total, effect).T)
+    return np.asarray(prior[:, None] * np.linalg.solve(total, effect).T)
 
 
 def _left_out(residuals: CheckResiduals, columns: FloatArray, names: Sequence[str]) -> FloatArray:
@@ -183,23 +190,23 @@ def _left_out(residuals: CheckResiduals, columns: FloatArray, names: Sequence[st
     for g in np.unique(scan):
         out = np.repeat(scan == g, 3)
         keep = np.flatnonzero(~out)
-        change = -_gain(residuals, columns, names, keep) @ y[keep]
+        change = -gain(residuals, columns, _prior(names), keep) @ y[keep]
         left = (y[out] + effect[out] @ change).reshape(-1, 3)
         errors[scan == g] = np.linalg.norm(left, axis=1)
     return errors
 
 
-def _covariance(parent: Calibration, residuals: CheckResiduals, columns: FloatArray, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    """(P, P) of the new calibration and (k,) standard uncertainties of the change."""
+def moved_covariance(parent: Calibration, residuals: CheckResiduals, columns: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(P, P) of the calibration with amplitudes estimated, and (k,) standard uncertainties of these; arguments as of `gain`."""
     m, size = residuals.n_shots, len(parent.covariance)
     sensitivity = residuals.sensitivity.reshape(3 * m, -1)
-    gain, prior = _gain(residuals, columns, names), np.diag(_prior(names) ** 2)
+    estimate = gain(residuals, columns, prior)
     noise = residuals.covariance_mm2 - sensitivity @ parent.covariance @ sensitivity.T
-    kept = np.eye(size) - columns @ gain @ sensitivity
-    open_ = np.eye(len(names)) - gain @ sensitivity @ columns
-    inner = open_ @ prior @ open_.T + gain @ noise @ gain.T
+    kept = np.eye(size) - columns @ estimate @ sensitivity
+    open_ = (np.eye(len(prior)) - estimate @ sensitivity @ columns) * prior
+    inner = open_ @ open_.T + estimate @ noise @ estimate.T
     covariance = kept @ parent.covariance @ kept.T + columns @ inner @ columns.T
-    sigma = np.sqrt(np.diagonal(inner + gain @ sensitivity @ parent.covariance @ sensitivity.T @ gain.T))
+    sigma = np.sqrt(np.diagonal(inner + estimate @ sensitivity @ parent.covariance @ sensitivity.T @ estimate.T))
     return np.asarray((covariance + covariance.T) / 2), np.asarray(sigma)
 
 
