@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from measure.cli_history import HistoryPlace
 from measure.cli_run import AsJson, Debug, Quiet, command
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ def inspect(
     calibration: Annotated[Path | None, typer.Option("--calibration", help="What the cloud was stitched with: for uncertainties.")] = None,
     session: Annotated[Path | None, typer.Option("--session", help="What was stitched: goes with --calibration.")] = None,
     no_recording: Annotated[bool, typer.Option("--no-recording", help="Leave the Rerun recording out.")] = False,
+    history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -46,7 +48,20 @@ def inspect(
         tell_inspection(run.console, result)
         write_outputs(out, result, recording=not no_recording)
         run.console.say(f"{out / 'inspection.html'} written")
-        run.finish({**result.to_json_dict(), "out": out}, verdict=result.verdict)
+        doubts = _doubts(run.console, calibration, session, history)
+        run.finish({**result.to_json_dict(), "marked": doubts, "out": out}, verdict=result.verdict)
+
+
+def _doubts(console: Console, calibration: Path | None, session: Path | None, history: str | None) -> list[str]:
+    """What the history says of the calibration at the time of the session; nothing where they are not named."""
+    if calibration is None or session is None:
+        return []
+    from calibrate import Calibration
+    from drivers.files.session import read_session
+    from measure.cli_history import marked
+    from measure.history.recording import last_taken_utc, place_of
+
+    return marked(console, place_of(history, calibration), Calibration.load(calibration), last_taken_utc([read_session(session)]))
 
 
 def tell_inspection(console: Console, result: Inspection) -> None:
