@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import ipaddress
+import logging
 import queue
 import time
 import uuid
@@ -44,6 +45,7 @@ class _Client(Protocol):
     def close(self, timeout: float) -> None: ...
 
 
+_LOG = logging.getLogger(__name__)
 _LOOK_S = 1.0
 _LOST = ("KilledWorker", "CancelledError", "FutureCancelledError", "TimeoutError", "CommClosedError")
 
@@ -72,7 +74,7 @@ class DaskPool:
         self._address, self._work, self._timeout_s = address, work, timeout_s
         self._ended: queue.Queue[str] = queue.Queue()
         self._flying: dict[str, tuple[_Future, float]] = {}
-        self._n_workers, self._looked_s = 0, -_LOOK_S
+        self._n_workers, self._looked_s, self._missed = 0, -_LOOK_S, False
         try:
             self._client: _Client = distributed.Client(address, timeout=answer_s, set_as_default=False)
         except (OSError, TimeoutError) as error:
@@ -84,6 +86,9 @@ class DaskPool:
         """Workers of the cluster that none of our jobs is meant for."""
         if time.monotonic() - self._looked_s >= _LOOK_S:
             self._n_workers, self._looked_s = len(self._client.scheduler_info(n_workers=-1)["workers"]), time.monotonic()
+            if not self._n_workers and not self._missed:
+                _LOG.warning("the Dask scheduler at %s has no workers; jobs wait for them", self._address)
+            self._missed = not self._n_workers
         return self._n_workers - len(self._flying)
 
     def submit(self, ticket: str, order: Order) -> None:

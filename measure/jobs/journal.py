@@ -22,7 +22,7 @@ from drivers.errors import FileError, SettingsError
 from drivers.files.checks import parse_json_object
 from drivers.files.disk import decode_text, read_bytes, sync_folder
 from measure.console import json_text
-from measure.running_record import now_utc
+from measure.history.store import now_utc
 
 _LOG = logging.getLogger(__name__)
 JOURNAL = "journal.jsonl"

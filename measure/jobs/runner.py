@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.errors import FileError
+from measure.history.store import now_utc
 from measure.jobs.failures import failure_of
 from measure.jobs.finder import Finder
 from measure.jobs.journal import Event, JobRecord, Journal
@@ -26,7 +27,6 @@ from measure.jobs.outputs import clear_abandoned, prepare, read_result, remove_d
 from measure.jobs.page import write_page
 from measure.jobs.pool import Executor
 from measure.jobs.work import facts_of_result
-from measure.running_record import now_utc
 
 _LOG = logging.getLogger(__name__)
 _LOOK_S = 0.25

@@ -81,7 +81,7 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
     """Measure into a folder; the text of its result.json."""
     from measure.console import json_text
     from measure.history.recording import last_taken_utc
-    from measure.running_record import now_utc
+    from measure.history.store import now_utc
 
     trust = trust_in(order.history, calibration, session)
     stitched, marks = _stitched(order, calibration, session, working)

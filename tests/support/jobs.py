@@ -19,7 +19,7 @@ from measure.jobs.model import Files, Order, Outcome, Recipe, Work
 from measure.jobs.outputs import keep_copy, prepare
 from measure.jobs.parts import parts_in
 from measure.jobs.pool import Executor
-from measure.jobs.runner import Runner, RunSettings, Summary
+from measure.jobs.runner import Recorder, Runner, RunSettings, Summary
 from measure.jobs.work import measure_part
 from tests.support.recorded import nominal_calibration, record_session, write_cell
 
@@ -148,6 +148,8 @@ def run_jobs(
     executor: Executor | None = None,
     *,
     recipe: Recipe | None = None,
+    files: Files | None = None,
+    recorder: Recorder | None = None,
     history: str | None = None,
     on_made: Callable[[Runner], None] | None = None,
     retry_dead: bool = False,
@@ -160,7 +162,7 @@ def run_jobs(
     prepare(out)
     copy, _ = keep_copy(out, parts.calibration)
     given = recipe or Recipe(Calibration.load(copy).id)
-    runner = Runner(out, given, Files(copy), lambda: parts_in(parts.folder), executor or InPlace(), settings)
+    runner = Runner(out, given, files or Files(copy), lambda: parts_in(parts.folder), executor or InPlace(), settings, recorder=recorder)
     if on_made is not None:
         on_made(runner)
     return runner.run()

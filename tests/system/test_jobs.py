@@ -80,10 +80,13 @@ def last_run(out: Path, command: Sequence[str], kill_worker_at: int) -> dict[str
 
 
 def kill_a_worker(out: Path) -> None:
-    """The process that ended the latest job."""
-    latest = [str(event["worker"]) for event in events(out) if event["event"] == "done" and event.get("worker")][-1]
-    with suppress(ProcessLookupError):
-        os.kill(int(latest.rpartition(":")[2]), signal.SIGKILL)
+    """The process that ended the latest job, or one before it if that has been let go."""
+    for event in reversed(events(out)):
+        if event["event"] == "done" and event.get("worker"):
+            with suppress(ProcessLookupError):
+                os.kill(int(str(event["worker"]).rpartition(":")[2]), signal.SIGKILL)
+                return
+    pytest.fail("no worker was found to be killed")
 
 
 def check(parts: Parts, out: Path, summary: dict[str, object]) -> None:

@@ -13,20 +13,23 @@ import pytest
 from calibrate.result import Calibration
 from drivers.errors import FileError
 from drivers.files.session import read_session
+from drivers.files.yaml import dump_yaml
 from measure.history.store import History
 from measure.jobs import outputs
 from measure.jobs import runner as runner_module
 from measure.jobs import work as work_module
 from measure.jobs.failures import TOO_LARGE, UNFINISHED, failure_of
+from measure.jobs.inspection import record_inspection
 from measure.jobs.journal import Event, Journal, read_state
 from measure.jobs.memory import estimated_mb
-from measure.jobs.model import Order, Outcome, Recipe
+from measure.jobs.model import Files, Order, Outcome, Recipe
 from measure.jobs.outputs import attempt_folder, clear_abandoned, commit
 from measure.jobs.parts import MARKER
 from measure.jobs.work import CLOUD_FILE
 from measure.stitch import stitch
 from tests.support.job_works import light, moody
 from tests.support.jobs import DAMAGE, InPlace, Parts, make_parts, read_lines, run_jobs, without_joints
+from tests.support.recorded import PLACES
 
 EXPECTED = {
     "truncated scan": "is cut off",
@@ -97,6 +100,7 @@ def test_a_result_is_what_stitch_writes_and_names_its_calibration(good: Parts, t
 
 def test_a_failed_or_overdue_check_marks_the_result_that_names_it(good: Parts, tmp_path: Path) -> None:
     """One after the other in the same history: none yet, a good one, an overdue one, a failed one."""
+    shutil.rmtree(good.folder / good.good[1])
     calibration = Calibration.load(good.calibration)
     place = str(tmp_path / "history.sqlite")
 
@@ -104,7 +108,7 @@ def test_a_failed_or_overdue_check_marks_the_result_that_names_it(good: Parts, t
         summary = run_jobs(good, tmp_path / "out", history=place, recipe=Recipe(calibration.id, voxel_mm))
         found = max((tmp_path / "out" / "results").glob("*/result.json"), key=lambda path: path.stat().st_mtime_ns)
         data = json.loads(found.read_text(encoding="utf-8"))
-        assert summary.marked == (2 if data["marks"] else 0)
+        assert summary.marked == (1 if data["marks"] else 0)
         return data["last_check"], " ".join(data["marks"])
 
     def checked(taken_utc: str, verdict: str) -> None:
@@ -323,3 +327,40 @@ def test_told_to_stop_it_ends_after_the_jobs_at_work(good: Parts, tmp_path: Path
     assert summary.interrupted
     assert (summary.done, len(summary.waiting)) == (1, 1)
     assert run_jobs(good, tmp_path / "out", InPlace(light)).done == 1
+
+
+def test_with_a_mesh_a_part_is_inspected_and_kept_in_the_history(good: Parts, tmp_path: Path) -> None:
+    import trimesh
+
+    shutil.rmtree(good.folder / good.good[1])
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=19.05)
+    mesh.apply_translation(PLACES["A"])
+    mesh.export(tmp_path / "part.stl")
+    spec = {
+        "format": "spherecal-inspection/1",
+        "features": {"ball": {"kind": "sphere", "centre_mm": list(PLACES["A"]), "diameter_mm": 38.1, "axis": [0, 0, 1], "cap_deg": 80}},
+        "checks": [{"kind": "diameter", "feature": "ball", "tolerance": 20.0}],
+    }
+    (tmp_path / "inspection.yaml").write_text(dump_yaml(spec), encoding="utf-8")
+    calibration = Calibration.load(good.calibration)
+    files = Files(good.calibration, nominal=tmp_path / "part.stl", spec=tmp_path / "inspection.yaml")
+    place = str(tmp_path / "history.sqlite")
+
+    def keep(folder: Path) -> None:
+        record_inspection(place, calibration, good.calibration, folder)
+
+    recipe = Recipe(calibration.id, nominal_sha256="m" * 64)
+    summary = run_jobs(good, tmp_path / "out", recipe=recipe, files=files, history=place, recorder=keep)
+    assert (summary.done, summary.dead_letters) == (1, [])
+    verdicts = {}
+    for folder in (tmp_path / "out" / "results").iterdir():
+        result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        written = json.loads((folder / "inspection" / "inspection.json").read_text(encoding="utf-8"))
+        assert result["verdict"] == written["verdict"] == result["inspection"]["verdict"]
+        assert (folder / "inspection" / "inspection.html").is_file()
+        verdicts[result["part"]] = result["verdict"]
+        keep(folder)  # as after a kill: told twice, kept once
+    with History.open(place) as history:
+        kept = {str(row.data["part"]): row.verdict for row in history.results(calibration.cell_name, "inspection")}
+        assert len(history.results(calibration.cell_name, "inspection")) == 1
+    assert kept == verdicts
