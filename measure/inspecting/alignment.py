@@ -15,12 +15,14 @@ from measure.inspecting.features import PartCloud
 from measure.inspecting.fitting import PatchSums, Response, patch_covariance, patches_of
 from measure.inspecting.geometry import Element
 
-_THINNED = 8_000
-_ROUNDS = 60
+_THINNED = 5_000
+_ROUNDS = 50
 _CELLS_ACROSS = 8
 _FIRST_LIMIT = 0.1
 """Of the part's size: how far apart points and mesh may be at first."""
 _SMALLEST_LIMIT_MM = 0.5
+_NEAR = 0.01
+"""Of the part's size: points of a fitted part lie nearer than this."""
 _SCALES = 4.0
 _SETTLED_MM = 1e-4
 _LEAST_OVERLAP, _PLAINLY_RIGHT = 0.25, 0.9
@@ -83,10 +85,10 @@ def _iterate(surface: NominalSurface, points: FloatArray, start: FloatArray) -> 
         weight = (1 - np.clip(residual / max(4.685 * scale, 1e-3), -1, 1) ** 2) ** 2
         twist = _step(near.nearest_mm[kept], near.normal[kept], residual, weight)
         transform = se3.exp(twist) @ transform
-        limit = max(min(limit, 3 * limit * 0.5, 6 * scale), _SMALLEST_LIMIT_MM)
+        limit = max(min(limit, 6 * scale), _SMALLEST_LIMIT_MM)
         if np.linalg.norm(twist[:3]) + size * np.linalg.norm(twist[3:]) < _SETTLED_MM:
             break
-    share = float(np.mean(np.abs(near.signed_mm) < max(_SMALLEST_LIMIT_MM, 6 * scale)))
+    share = float(np.mean(np.abs(near.signed_mm) < max(_SMALLEST_LIMIT_MM, min(6 * scale, _NEAR * size))))
     return transform, float(np.mean(np.minimum(np.abs(near.signed_mm), 0.02 * size))), share
 
 
@@ -98,7 +100,7 @@ def _step(nearest: FloatArray, normal: FloatArray, residual: FloatArray, weight:
 
 def _finished(surface: NominalSurface, cloud: PartCloud, transform: FloatArray) -> BestFit:
     """The last fit, by plain least squares of all points that belong to the part; and how well it is known."""
-    stride = max(1, len(cloud.points_mm) // (12 * _THINNED))
+    stride = max(1, len(cloud.points_mm) // (20 * _THINNED))
     for _ in range(3):
         points = se3.apply(transform, cloud.points_mm[::stride])
         near = surface.nearest(points)

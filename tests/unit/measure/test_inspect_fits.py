@@ -137,7 +137,7 @@ def _bumps(points: FloatArray, length_mm: float) -> Callable[[np.random.Generato
 
     def draw(rng: np.random.Generator) -> FloatArray:
         waves = rng.normal(0, 1 / length_mm, (60, 3))
-        return np.sqrt(2 / 60) * np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, 60)).sum(axis=1)
+        return np.asarray(np.sqrt(2 / 60) * np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, 60)).sum(axis=1))
 
     return draw
 

@@ -29,7 +29,7 @@ def box_points(n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def box_mesh(spoil: Callable[[trimesh.Trimesh], None] | None = None) -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(BOX).subdivide().subdivide()
+    mesh: trimesh.Trimesh = trimesh.creation.box(BOX).subdivide().subdivide()
     if spoil is not None:
         spoil(mesh)
     return mesh
