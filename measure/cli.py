@@ -26,7 +26,7 @@ from measure.cli_history import activate, diff, history, rollback
 from measure.cli_import import import_session
 from measure.cli_inspect import inspect
 from measure.cli_jobs import jobs
-from measure.cli_measure import stitch, verify
+from measure.cli_measure import verify
 from measure.cli_plan import plan
 from measure.cli_predict import predict
 from measure.cli_preview import preview
@@ -34,6 +34,7 @@ from measure.cli_report import report, show
 from measure.cli_run import run_app
 from measure.cli_serve import serve_cell
 from measure.cli_solve import calibrate, centres
+from measure.cli_stitch import stitch
 from measure.cli_study import study
 from measure.cli_teach import teach
 from measure.console import Console

@@ -1,4 +1,4 @@
-"""`spherecal verify` and `spherecal stitch`: what a calibration is worth, and what it is for."""
+"""`spherecal verify`: what a calibration is worth."""
 
 from __future__ import annotations
 
@@ -131,31 +131,3 @@ def _rms(values: list[float]) -> float | None:
 
 def _worst(values: list[float]) -> float | None:
     return max((abs(value) for value in values), default=None)
-
-
-def stitch(
-    calibration: CalibrationFile,
-    session: Annotated[Path, typer.Argument(help="The session whose scans are to be put together.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The cloud to write (PLY, mm, robot base).")] = Path("cloud.ply"),
-    voxel: Annotated[float, typer.Option("--voxel", metavar="MM", help="Edge of the voxels: one point each.")] = 0.5,
-    keep_edges: Annotated[bool, typer.Option("--keep-edges", help="Keep flying pixels at depth edges.")] = False,
-    history: HistoryPlace = None,
-    as_json: AsJson = False,
-    debug: Debug = False,
-    quiet: Quiet = False,
-) -> None:
-    """Put the scans of a session together into one cloud in the robot base."""
-    with command(as_json, debug, quiet) as run:
-        from calibrate import Calibration
-        from drivers.files.session import read_session
-        from measure.history.recording import last_taken_utc, place_of
-        from measure.stitch import stitch as stitch_session
-
-        loaded, read = Calibration.load(calibration), read_session(session)
-        with run.console.progress("stitching") as advance:
-            result = stitch_session(loaded, read, out, voxel, clean_edges=not keep_edges, on_progress=advance)
-        run.console.say(f"{result.n_points} points of {result.n_points_in} read, from {result.n_scans} scans, in {out} ({result.seconds:.1f} s)")
-        for mark in result.marks:
-            run.console.note(mark)
-        doubts = marked(run.console, place_of(history, calibration), loaded, last_taken_utc([read]))
-        run.finish({**result.to_json_dict(), "marked": doubts})

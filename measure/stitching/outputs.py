@@ -42,15 +42,19 @@ def check_suffix(out: Path) -> None:
         SettingsError: an unknown ending, or a library that is not installed.
         FileError: no such folder.
     """
-    if out.suffix.lower() not in SUFFIXES:
-        kind = out.suffix or "files without an ending"
-        raise SettingsError(f"clouds are not written as {kind}", where=str(out), remedy=f"Choose one of {', '.join(SUFFIXES)}.")
+    if _ending(out) not in SUFFIXES:
+        raise SettingsError(f"clouds are not written as {out.suffix}", where=str(out), remedy=f"Choose one of {', '.join(SUFFIXES)}.")
     if not out.parent.is_dir():
         raise FileError("no such folder", file=out.parent, remedy="Make it first.")
-    if out.suffix.lower() == ".e57":
+    if _ending(out) == ".e57":
         _pye57()
-    if out.suffix.lower() in {".laz", ".las"}:
+    if _ending(out) in {".laz", ".las"}:
         _laspy()
+
+
+def _ending(out: Path) -> str:
+    """A name without an ending is a PLY file."""
+    return out.suffix.lower() or ".ply"
 
 
 def write_cloud(out: Path, pieces: Iterable[FusedCloud], n_points: int, label: CloudLabel) -> None:
@@ -63,7 +67,7 @@ def write_cloud(out: Path, pieces: Iterable[FusedCloud], n_points: int, label: C
         SettingsError: as `check_suffix`.
     """
     check_suffix(out)
-    match out.suffix.lower():
+    match _ending(out):
         case ".ply":
             header = ply_header(_RECORD, (n_points,), label.comments)
             write_atomic_pieces(out, _with_header(header, pieces))

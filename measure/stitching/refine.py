@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import SettingsError
 from drivers.files.session import Shot
@@ -22,6 +23,8 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.fuse import VoxelGrid
 from measure.stitching.scan import PreparedScan, StitchingSystem
+
+IntArray = NDArray[np.int64]
 
 VOXEL_MM = 1.5
 """Of the clouds that are registered."""
@@ -88,7 +91,7 @@ def require_registration() -> Any:
     return small_gicp
 
 
-def surface_of(shot: Shot, xyz_in_camera_mm: FloatArray, scan: PreparedScan) -> ScanSurface:
+def surface_of(shot: Shot, xyz_in_camera_mm: NDArray[np.float32], scan: PreparedScan) -> ScanSurface:
     """The points that are registered: means of coarse voxels with a normal."""
     grid = VoxelGrid(VOXEL_MM)
     grid.add(scan.points_in_base_mm, weights=scan.weights, normals=scan.normals)
@@ -180,7 +183,7 @@ def _overlapping(scans: Sequence[ScanSurface]) -> list[tuple[int, int]]:
 
 def _registered(
     library: Any, system: StitchingSystem, target: ScanSurface, source: ScanSurface, centre: FloatArray
-) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+) -> tuple[FloatArray, FloatArray, tuple[IntArray, IntArray]]:
     """The motion (6,) that brings the source to the target, its information (6, 6), and matched rows of source and target."""
     from scipy.spatial import cKDTree
 
@@ -192,8 +195,8 @@ def _registered(
     moved = np.asarray(found.T_target_source)
     # about the centre, which is the origin here, a small motion is its translation and rotation vector
     twist = np.concatenate([moved[:3, 3], se3.log_so3(moved[:3, :3])])
-    distance, row = cKDTree(shifted[0]).query(se3.apply(moved, shifted[1]), distance_upper_bound=_REACH_MM)
-    rows = np.flatnonzero(np.isfinite(distance))
+    distance, nearest = cKDTree(shifted[0]).query(se3.apply(moved, shifted[1]), distance_upper_bound=_REACH_MM)
+    row, rows = np.asarray(nearest, dtype=np.int64), np.flatnonzero(np.isfinite(distance)).astype(np.int64)
     rows = rows[(source.normals[rows] * target.normals[row[rows]]).sum(axis=1) > 0.8]
     normals = source.normals[rows]
     lever = np.concatenate([normals, np.cross(shifted[1][rows], normals)], axis=1)
@@ -202,7 +205,7 @@ def _registered(
     return twist, np.asarray(weight * lever.T @ lever), (rows, row[rows])
 
 
-def _bounded(motions: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _bounded(motions: FloatArray, prior: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Motions (m, 6) cut back to what is believed possible of each, and which ones were."""
     bounded = np.zeros(len(motions), dtype=np.bool_)
     result = motions.copy()
@@ -227,7 +230,7 @@ def _shift_mm(scan: ScanSurface, motion: FloatArray, centre: FloatArray) -> floa
 
 
 def _disagreement_mm(
-    scans: Sequence[ScanSurface], matched: Sequence[tuple[int, int, FloatArray, FloatArray]], motions: FloatArray, centre: FloatArray
+    scans: Sequence[ScanSurface], matched: Sequence[tuple[int, int, IntArray, IntArray]], motions: FloatArray, centre: FloatArray
 ) -> float:
     squares, n = 0.0, 0
     for target, source, rows, others in matched:

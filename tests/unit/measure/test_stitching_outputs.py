@@ -49,7 +49,7 @@ def test_open3d_reads_points_and_normals(grid: VoxelGrid, tmp_path: Path, suffix
     import open3d
 
     cloud, out = written(grid, tmp_path / f"cloud{suffix}"), tmp_path / f"cloud{suffix}"
-    theirs = open3d.io.read_point_cloud(str(out))
+    theirs = open3d.io.read_point_cloud(out)
     np.testing.assert_allclose(np.asarray(theirs.points), cloud.points_mm, atol=1e-4)
     np.testing.assert_allclose(np.asarray(theirs.normals), cloud.normals, atol=1e-6)
     ours = parse_cloud(out.read_bytes(), file=out)

@@ -1,0 +1,65 @@
+"""A fused cloud as a Rerun recording: points coloured by their uncertainty and by their spread."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import FileError
+
+if TYPE_CHECKING:
+    from measure.fuse import FusedCloud
+
+_METRES_PER_MM = 1e-3
+_MOST_POINTS = 2_000_000
+_RADIUS_UI = -1.5
+"""Negative: on the screen, not in the scene."""
+
+
+def write_cloud_recording(path: str | Path, cloud: FusedCloud, *, title: str) -> Path:
+    """Write a recording of a cloud beside `path` and rename it into place; returns the path.
+
+    Raises:
+        FileError: the folder is missing or not writable.
+    """
+    import rerun as rr
+
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileError("no such folder", file=target.parent, remedy="Make it first.")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    shown = slice(None, None, max(1, -(-len(cloud.count) // _MOST_POINTS)))
+    points = (cloud.points_mm[shown] * _METRES_PER_MM).astype(np.float32)
+    try:
+        stream = rr.RecordingStream("spherecal")
+        stream.save(temporary)
+        stream.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for name, values in (("uncertainty", cloud.uncertainty_mm), ("spread", cloud.spread_mm)):
+            if np.isfinite(values).any():
+                low, high = (float(limit) for limit in np.nanpercentile(values, [2, 98]))
+                colours = _colours(values[shown], low, high)
+                stream.log(f"base/{name}", rr.Points3D(points, colors=colours, radii=_RADIUS_UI), static=True)
+                stream.log(f"legend/{name}", rr.TextDocument(f"{name}: blue {low:.4f} mm to yellow {high:.4f} mm"), static=True)
+        text = f"{title}\n\n{len(cloud.count)} points, voxels of {cloud.voxel_mm:g} mm, drawn in metres"
+        stream.log("legend/title", rr.TextDocument(text), static=True)
+        stream.flush()
+        stream.disconnect()
+        os.replace(temporary, target)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):
+            raise FileError(f"cannot be written ({error.strerror or error})", file=target, remedy="Check that the folder is writable.") from error
+        raise
+    return target
+
+
+def _colours(values: NDArray[np.float32], low: float, high: float) -> NDArray[np.uint8]:
+    """From blue to yellow, both of which people who see no red or no green tell apart."""
+    share = np.nan_to_num(np.clip((values - low) / max(high - low, 1e-9), 0, 1))[:, None]
+    return np.asarray((1 - share) * np.array([30.0, 60.0, 160.0]) + share * np.array([250.0, 220.0, 60.0]), dtype=np.uint8)
