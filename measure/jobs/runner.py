@@ -173,6 +173,9 @@ class Runner:
                 done: Event = {"event": "done", "job": record.id, "seconds": None, "facts": None if text is None else facts_of_result(text)}
                 events.append({"event": "interrupted", "job": record.id} if text is None else done)
         self._journal.write(*events)
+        for record in self._journal.state.jobs.values():
+            if record.state != "dead":  # killed between `done` and this
+                remove_dead_letter(self._out, record.name)
 
     def _look(self) -> None:
         """Look for parts: a little at a time while workers are busy, and not again too soon."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import measure.cli_jobs
 from measure.cli import app
 from measure.cli_run import run_app
+from measure.jobs.model import Order, Outcome
 from tests.support.job_works import light
 from tests.support.jobs import InPlace, Parts, make_parts
 
@@ -59,6 +61,21 @@ def test_a_list_ends_when_its_parts_are_settled(parts: Parts, tmp_path: Path, ca
     listed.write_text(f"{parts.folder / parts.good[0]}\n", encoding="utf-8")
     code, printed = run(capfd, "run", listed, "--calibration", parts.calibration, "-o", tmp_path / "out", "--settle", 0)
     assert (code, printed["done"]) == (0, 1)
+
+
+def test_stopped_by_a_signal_it_tells_what_is_done_and_left(
+    parts: Parts, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopping(order: Order) -> Outcome:
+        signal.raise_signal(signal.SIGTERM)
+        return light(order)
+
+    monkeypatch.setattr(measure.cli_jobs, "_executor", lambda *_arguments: InPlace(stopping))
+    code, printed = run(capfd, "run", parts.folder, "--calibration", parts.calibration, "-o", tmp_path / "out", "--settle", 0)
+    assert code == 130
+    assert printed["interrupted"] is True
+    assert int(str(printed["done"])) + int(str(printed["failed"])) == 1
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize(

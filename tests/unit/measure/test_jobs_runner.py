@@ -275,6 +275,31 @@ def test_killed_at_every_step_nothing_is_lost_or_done_twice(good: Parts, tmp_pat
     assert moment > 40
 
 
+@pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.qualify)])
+def test_killed_at_every_step_of_a_second_chance_the_dead_letter_goes(good: Parts, tmp_path: Path, stride: int) -> None:
+    """A truncated scan is restored; the run that finds the part anew ends at step 1 + stride, 1 + 2 stride, ..."""
+    shutil.rmtree(good.folder / good.good[1])
+    scan = good.folder / good.good[0] / "scans" / "0000.ply"
+    data, moment = scan.read_bytes(), 0
+    while not (tmp_path / f"out{moment}" / "whole").exists():
+        moment += stride
+        out = tmp_path / f"out{moment}"
+        scan.write_bytes(data[:-9])
+        assert run_jobs(good, out, InPlace(light)).failed == 1
+        scan.write_bytes(data)
+        with pytest.MonkeyPatch.context() as patch:
+            killed_at(patch, moment)
+            try:
+                run_jobs(good, out, InPlace(light))
+                (out / "whole").touch()
+            except Killed:
+                run_jobs(good, out, InPlace(light))
+        assert names(out / "results") == [good.good[0]]
+        assert names(out / "dead_letters") == []
+        assert [record.state for record in read_state(out).jobs.values()] == ["done"]
+    assert moment > 8
+
+
 def check_whole(out: Path, done: list[str], dead: list[str]) -> None:
     assert names(out / "results") == sorted(done)
     assert names(out / "dead_letters") == sorted(dead)
