@@ -214,7 +214,7 @@ class MarginalCost:
         right = scale * gradient
         log_det = float(np.linalg.slogdet(scaled)[1] - 2 * np.log(scale).sum())
         log_prior = len(sums.pose_noise) * float(np.log(pose_precision).sum())
-        return log_determinant - log_prior + log_det + cost - float(right @ np.linalg.solve(scaled, right))
+        return float(log_determinant - log_prior + log_det + cost - right @ np.linalg.solve(scaled, right))
 
 
 def marginal_cost(linearised: Linearised, pose_precision: FloatArray) -> float:
