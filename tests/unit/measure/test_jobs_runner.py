@@ -8,10 +8,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calibrate.result import Calibration
 from drivers.errors import FileError
+from drivers.files.ply import read_ply
 from drivers.files.session import read_session
 from drivers.files.yaml import dump_yaml
 from measure.history.store import History
@@ -352,6 +354,25 @@ def test_told_to_stop_it_ends_after_the_jobs_at_work(good: Parts, tmp_path: Path
     assert summary.interrupted
     assert (summary.done, len(summary.waiting)) == (1, 1)
     assert run_jobs(good, tmp_path / "out", InPlace(light)).done == 1
+
+
+def test_scans_with_poses_are_measured_like_the_session_they_came_from(good: Parts, tmp_path: Path) -> None:
+    session = read_session(good.folder / good.good[0])
+    folder = good.folder / "loose"
+    shutil.copytree(session.folder / "scans", folder / "clouds")
+    lines = ["file,j1,j2,j3,j4,j5,j6"]
+    lines += [
+        ",".join([Path(str(shot.scan)).name, *(f"{angle:.12f}" for angle in np.degrees(np.asarray(shot.joints_rad)))]) for shot in session.shots
+    ]
+    (folder / "poses.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    calibration = Calibration.load(good.calibration)
+    files = Files(good.calibration, cell=session.cell_path)
+    summary = run_jobs(good, tmp_path / "out", recipe=Recipe(calibration.id, cell_sha256="c" * 64), files=files)
+    assert (summary.done, summary.dead_letters) == (3, [])
+    clouds = [read_ply(next((tmp_path / "out" / "results").glob(f"{name}-*")) / CLOUD_FILE) for name in ("loose", good.good[0])]
+    np.testing.assert_allclose(clouds[0].points_mm, clouds[1].points_mm, atol=1e-4)
+    # without a cell file nobody can tell which robot it was
+    assert "scans and poses without a session" in str(run_jobs(good, tmp_path / "none").dead_letters)
 
 
 def test_with_a_mesh_a_part_is_inspected_and_kept_in_the_history(good: Parts, tmp_path: Path) -> None:
