@@ -25,7 +25,7 @@ def url() -> Iterator[str]:
 
 def test_a_history_in_postgresql(url: str, tmp_path: Path) -> None:
     # two processes that make the tables and write at once
-    n = 15
+    n = 8
     writers = [writer(url, who, n) for who in "ab"]
     for process in writers:
         _, trouble = process.communicate(timeout=120)
@@ -38,15 +38,6 @@ def test_a_history_in_postgresql(url: str, tmp_path: Path) -> None:
         assert history.previous(CELL) == named(1).id
         assert history.yaml_of("000002") == file_of(tmp_path, 2).read_text()
     assert "the cell has used" in marks_of(url, named(1))[0]
-    # a writer that is killed leaves what it told
-    process = writer(url, "c")
-    assert process.stdout is not None
-    while int(process.stdout.readline()) < 5:
-        pass
-    process.kill()
-    process.communicate(timeout=60)
-    with History.open(url) as history:
-        assert len([row for row in history.results(CELL) if row.calibration == "c" * 64]) >= 5
 
 
 @pytest.mark.parametrize("statement", ["DELETE FROM result", "UPDATE result SET cell = 'x'", "TRUNCATE result"])
