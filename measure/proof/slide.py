@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from calibrate.study_paper import TABLE_5
 from measure.proof.lengths import LengthResult
 
+NOTHING = "–"
 _PAPER_MEAN_MM, _PAPER_MAX_MM, _PAPER_STD_MM = TABLE_5["1"]
 PAPER_TEXT = f"the paper's method 1 prints {_PAPER_MEAN_MM:.4f} mean, {_PAPER_MAX_MM:.4f} max, {_PAPER_STD_MM:.4f} std over 25 pairs on hardware"
 CAUTION = (
@@ -20,13 +21,16 @@ CAUTION = (
 )
 
 
-def slide_rows(slides: Sequence[LengthResult]) -> list[list[object]]:
+def slide_rows(slides: Sequence[LengthResult]) -> list[tuple[str, ...]]:
     """One row a slide: name, pairs, mean, max, std, signed mean, why refused; the paper's last."""
-    rows: list[list[object]] = []
+    rows: list[tuple[str, ...]] = []
     for slide in slides:
         pairs = slide.pairs
-        figures = [0, None, None, None, None] if pairs is None else [pairs.n_pairs, pairs.mean_mm, pairs.max_mm, pairs.std_mm, pairs.signed_mean_mm]
-        rows.append([slide.label, *figures, slide.not_judged or ""])
+        figures = ("0", *[NOTHING] * 4)
+        if pairs is not None:
+            lengths = (pairs.mean_mm, pairs.max_mm, pairs.std_mm)
+            figures = (str(pairs.n_pairs), *(f"{length:.4f}" for length in lengths), f"{pairs.signed_mean_mm:+.4f}")
+        rows.append((slide.label, *figures, slide.not_judged or ""))
     if rows:
-        rows.append(["paper, method 1", 25, _PAPER_MEAN_MM, _PAPER_MAX_MM, _PAPER_STD_MM, None, ""])
+        rows.append(("paper, method 1", "25", *(f"{figure:.4f}" for figure in TABLE_5["1"]), NOTHING, ""))
     return rows

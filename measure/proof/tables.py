@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from measure.proof.probing import Probing
-from measure.proof.slide import CAUTION, slide_rows
+from measure.proof.slide import CAUTION, NOTHING, slide_rows
 from measure.report_page import Table
 from measure.verify_result import VerifyResult
-
-_NOTHING = "–"
 
 
 def proof_tables(result: VerifyResult) -> tuple[Table, ...]:
@@ -32,24 +30,17 @@ def _probing(result: VerifyResult) -> Table:
 
 def _figures(probing: Probing | None) -> tuple[str, ...]:
     if probing is None:
-        return (_NOTHING,) * 7
+        return (NOTHING,) * 7
     return (str(probing.n_points), *(f"{form:.3f}" for form in probing.form_mm), *(f"{size:+.3f}" for size in probing.size_error_mm))
 
 
 def _slides(result: VerifyResult) -> Table:
-    rows = [tuple(_text(cell) for cell in row) for row in slide_rows(result.slides)]
     return Table(
         "Slide test, view by view",
         f"| |P1 - P2| - L | of single views of both ends, no two of a pair from the same robot pose. {CAUTION}",
         ("slide", "pairs", "mean, mm", "max, mm", "std, mm", "signed mean, mm", "refused"),
-        tuple(rows),
+        tuple(slide_rows(result.slides)),
     )
-
-
-def _text(cell: object) -> str:
-    if cell is None:
-        return _NOTHING
-    return f"{cell:.4f}" if isinstance(cell, float) else str(cell)
 
 
 def _outside(result: VerifyResult) -> Table:

@@ -62,8 +62,7 @@ def test_the_slide_test_on_the_declared_noise() -> None:
         print(seed, trials[-1].full, trials[-1].stepwise, trials[-1].published)
     of_stepwise, of_published = ratios_of(trials)
     print(f"full / stepwise {of_stepwise:.2f}, full / published {of_published:.2f}")
-    assert of_published <= 0.6
-    assert of_stepwise <= 0.7
+    assert max(of_stepwise, of_published) <= 0.6
 
 
 def test_one_slide() -> None:
