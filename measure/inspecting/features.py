@@ -91,10 +91,10 @@ def points_near(shape: Shape, cloud: PartCloud) -> IntArray:
     """Rows of the cloud in a shape's region, whose normals agree where they are known."""
     low, high = _box(shape)
     points = cloud.points_mm
-    found = np.ones(len(points), dtype=np.bool_)
-    for axis in range(3):
-        found &= (points[:, axis] > low[axis]) & (points[:, axis] < high[axis])
-    rows = np.flatnonzero(found)
+    rows = np.flatnonzero((points[:, 0] > low[0]) & (points[:, 0] < high[0]))
+    for axis in (1, 2):
+        column = points[rows, axis]
+        rows = rows[(column > low[axis]) & (column < high[axis])]
     local = se3.apply(shape.local_from_part, points[rows])
     rows, local = _subset(shape.near(local), rows, local)
     if cloud.normals is not None and not (isinstance(shape, StadiumShape)) and len(rows):
