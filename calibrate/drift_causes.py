@@ -27,7 +27,7 @@ from drivers.kinematics.se3 import FloatArray
 
 HAND_EYE, CAMERA, SPHERE, SHOT = "hand-eye", "camera", "sphere moved", "single shot"
 
-FALSE_ALARM = 0.01
+FALSE_ALARM = 0.0125
 """Chance of an alarm where nothing changed, all tests together."""
 _SHARE = 0.05
 """Part of that for each test that names nothing: of all residuals, of axis 1, the last axis, spheres and single shots."""
