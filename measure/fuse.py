@@ -157,7 +157,7 @@ class VoxelGrid:
     @property
     def n_tiles(self) -> int:
         """How often the table went to disk."""
-        return self._tiles.n_runs
+        return self._tiles.n_spills
 
     def add(
         self,

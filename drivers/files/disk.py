@@ -83,7 +83,7 @@ def write_atomic_pieces(path: str | Path, chunks: Iterable[bytes | memoryview]) 
         raise _not_writable(target, error) from error
     try:
         with open(descriptor, "wb") as stream:
-            os.fchmod(stream.fileno(), 0o666 & ~_umask())
+            os.fchmod(stream.fileno(), usual_mode())
             for chunk in chunks:
                 stream.write(chunk)
             stream.flush()
@@ -117,8 +117,9 @@ def _not_writable(path: Path, error: OSError) -> FileError:
     return FileError(f"cannot be written ({reason})", file=path, remedy="Check that the folder exists, is writable and has room.")
 
 
-def _umask() -> int:
-    # mkstemp makes files only their owner can read; the umask can only be read by setting it
+def usual_mode() -> int:
+    """Of a new file: mkstemp makes files that only their owner can read."""
+    # the umask can only be read by setting it
     mask = os.umask(0o077)
     os.umask(mask)
-    return mask
+    return 0o666 & ~mask

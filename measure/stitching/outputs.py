@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FileError, SettingsError
-from drivers.files.disk import sync_folder, write_atomic_pieces
+from drivers.files.disk import sync_folder, usual_mode, write_atomic_pieces
 from drivers.files.ply import ply_header, read_ply
 from measure.fuse import FusedCloud
 
@@ -196,6 +196,7 @@ def _write_beside(out: Path, write: Callable[[Path], None]) -> None:
     try:
         write(temporary)
         with open(temporary, "rb") as stream:
+            os.fchmod(stream.fileno(), usual_mode())
             os.fsync(stream.fileno())
         os.replace(temporary, out)
         sync_folder(out.parent)

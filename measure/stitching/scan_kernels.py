@@ -49,7 +49,10 @@ class View(NamedTuple):
 
 @vectorised
 def _weight(noise: PointNoise, range2_mm2: float, lever2_mm2: float, cosine2: float) -> float:
-    """Inverse of the predicted random variance, 1 to 255 in units of 1 / UNIT_WEIGHT."""
+    """Inverse of the predicted random variance along the normal, 1 to 255 in units of 1 / UNIT_WEIGHT.
+
+    A turn of the flange moves a point along its normal by the part of the lever that is square to the normal.
+    """
     point = noise.point_mm2 * max(noise.flat + noise.steep * cosine2, 0.05)
     if noise.range_power != 0.0:
         point *= (range2_mm2 / noise.range_mm**2) ** noise.range_power
@@ -153,7 +156,10 @@ def _judge_row(
         along = nx * cx + ny * cy + nz * cz
         known = length2 > 0.0
         cosine2 = along * along / (length2 * range2) if known else MEAN_SQUARE_COSINE
-        weight = _weight(noise, range2, (x - fx) ** 2 + (y - fy) ** 2 + (z - fz) ** 2, cosine2)
+        lx, ly, lz = x - fx, y - fy, z - fz
+        across = nx * lx + ny * ly + nz * lz
+        lever2 = lx * lx + ly * ly + lz * lz - (across * across / length2 if known else 0.0)
+        weight = _weight(noise, range2, lever2, cosine2)
         surface = (count[u] >= min_neighbours) & (not np.isnan(x))
         kept = surface & (cosine2 >= least_cosine2)
         scale = (NORMAL_STEPS if along < 0.0 else -NORMAL_STEPS) / np.sqrt(length2) if known & kept else 0.0

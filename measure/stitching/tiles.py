@@ -31,6 +31,8 @@ class Tiles:
         self._runs: list[Path] = []
         self._folder: Path | None = None
         self._n_written = 0
+        self.n_spills = 0
+        """How often a table went to disk."""
 
     @property
     def n_runs(self) -> int:
@@ -60,18 +62,21 @@ class Tiles:
                 remedy="Free room on that disk, allow more memory, or use larger voxels.",
             ) from error
         self._runs.append(path)
+        self.n_spills += 1
 
     def settle(self) -> None:
         """Merge all runs into one; raises as `write_run`."""
         if len(self._runs) < 2:
             return
-        old = self._runs
+        old, spills = self._runs, self.n_spills
         self._runs = []
         try:
             self.write_run(_merged([_Run(path, self._words) for path in old]))
         except FileError:
             self._runs = old
             raise
+        finally:
+            self.n_spills = spills
         for path in old:
             path.unlink()
 

@@ -14,7 +14,9 @@ from drivers.errors import DataError
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, read_session
 from drivers.kinematics import se3
+from measure.fuse import VoxelGrid
 from measure.fuse_kernels import NORMAL_STEPS, UNIT_WEIGHT, VARIANCE_STEP_MM2
+from measure.stitching import scan_kernels
 from measure.stitching.scan import DEFAULT_CLEANING, NO_CLEANING, Cleaning, PreparedScan, prepare_scan, unit_variance_mm2
 from tests.support.recorded import TrueSystem, write_cell
 from tests.support.synthetic import paper_cell
@@ -147,14 +149,15 @@ def test_weights_are_inverse_predicted_variances(session: Session) -> None:
     normal = np.array([np.sin(tilt), 0, -np.cos(tilt)])
     cosine = np.abs(in_camera @ normal) / range_mm
     in_base = se3.apply(base_from_camera(), in_camera.reshape(-1, 3))
-    lever = np.linalg.norm(in_base - SYSTEM.base_from_flange(JOINTS_RAD)[:3, 3], axis=1).reshape(60, 80)
+    arm = in_base - SYSTEM.base_from_flange(JOINTS_RAD)[:3, 3]
+    lever = np.linalg.norm(np.cross(arm, base_from_camera()[:3, :3] @ normal), axis=1).reshape(60, 80)
     point = (NOISE.point_mm * (range_mm / NOISE.range_mm) ** NOISE.range_power) ** 2 * (NOISE.flat + NOISE.steep * cosine**2)
     variance = NOISE.pose_mm**2 + (NOISE.pose_rad * lever) ** 2 + NOISE.form_mm**2 + point
     expected = UNIT_WEIGHT * unit_variance_mm2(NOISE) / variance
     assert expected.max() / expected.min() > 1.1
     assert np.abs(scan.weights - expected).max() < 0.52
     loose = prepare(session, xyz.reshape(-1, 3))
-    average = 7 / 12
+    average, lever = 7 / 12, np.linalg.norm(arm, axis=1).reshape(60, 80)
     point = (NOISE.point_mm * (range_mm / NOISE.range_mm) ** NOISE.range_power) ** 2 * (NOISE.flat + NOISE.steep * average)
     expected = UNIT_WEIGHT * unit_variance_mm2(NOISE) / (NOISE.pose_mm**2 + (NOISE.pose_rad * lever) ** 2 + NOISE.form_mm**2 + point)
     assert np.abs(loose.weights.reshape(60, 80) - expected).max() < 0.52
@@ -213,3 +216,38 @@ class WrongUnit:
 def test_scans_in_another_unit_are_told(session: Session, unit: WrongUnit) -> None:
     with pytest.raises(DataError, match=unit.said):
         prepare(session, (plane_grid(0.0) * unit.factor).astype(np.float32))
+
+
+def test_the_stated_uncertainty_covers_what_pose_and_point_noise_do() -> None:
+    """Errors along the normal of fused points of a tilted plane, over many drawn sessions, in units of what is stated."""
+    tilt, n_scans, side = np.deg2rad(25), 5, 60
+    noise = NoiseModel(point_mm=0.03, pose_mm=0.02, pose_rad=2e-4)
+    view, point_noise = _view(noise)
+    ratios = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        grid = VoxelGrid(2.0, unit_variance_mm2=unit_variance_mm2(noise))
+        for _ in range(n_scans):
+            xyz = plane_grid(tilt)[:side, :side].astype(np.float64)
+            xyz += rng.normal(0, noise.point_mm, (side, side, 1)) * [np.sin(tilt), 0, -np.cos(tilt)]
+            moved = se3.exp(np.concatenate([rng.normal(0, noise.pose_mm, 3), rng.normal(0, noise.pose_rad, 3)]))
+            xyz = se3.apply(moved, xyz.reshape(-1, 3)).reshape(side, side, 3)
+            weights, normals = np.empty((side, side), dtype=np.uint8), np.empty((side, side, 3), dtype=np.int16)
+            links, fates = np.empty((side, side), dtype=np.uint8), np.zeros(4, dtype=np.int64)
+            scan_kernels.examine_grid(xyz, view, point_noise, 6 / 900, 3, 0.2, weights, normals, links, fates)
+            grid.add(xyz, weights=weights, normals=normals)
+        fused = grid.fused()
+        inside = (fused.scans == n_scans) & (fused.count > 40)
+        error = fused.points_mm[inside] @ [np.sin(tilt), 0, -np.cos(tilt)] + 400.0 * np.cos(tilt)
+        ratios.append(error / fused.uncertainty_mm[inside])
+    rms = float(np.sqrt(np.mean(np.concatenate(ratios) ** 2)))
+    # never too small; noise of single points is stated as if it did not average within a scan
+    assert 0.4 < rms < 1.1
+    assert np.mean(np.abs(np.concatenate(ratios)) < 2) > 0.95
+
+
+def _view(noise: NoiseModel) -> tuple[scan_kernels.View, scan_kernels.PointNoise]:
+    """Camera and flange at the origin of the base."""
+    squares = (noise.pose_mm**2, noise.pose_rad**2, noise.form_mm**2, noise.point_mm**2)
+    view = scan_kernels.View(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    return view, scan_kernels.PointNoise(*squares, noise.flat, noise.steep, noise.range_power, noise.range_mm, unit_variance_mm2(noise))
