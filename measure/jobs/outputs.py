@@ -109,10 +109,10 @@ def commit(working: Path, final: Path) -> bool:
     return True
 
 
-def clear_abandoned(out: Path) -> int:
-    """Remove attempts whose process is gone; the number of them."""
+def clear_abandoned(out: Path, name: str = "*") -> int:
+    """Remove attempts whose process is gone, of one job or of all; the number of them."""
     n_removed = 0
-    for working in (out / WORK).iterdir():
+    for working in (out / WORK).glob(f"{name}.*.tmp"):
         if working.is_dir() and _is_abandoned(working):
             shutil.rmtree(working, ignore_errors=True)
             n_removed += 1

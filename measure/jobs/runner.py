@@ -155,6 +155,7 @@ class Runner:
                 self._admit()
                 self._end_all(self._executor.collect(self._patience_s()))
                 self._draw_page()
+            clear_abandoned(self._out)
             self._summary.seconds = time.monotonic() - began
             self._close_summary()
             self._journal.write({"event": "run_ended", "done": self._summary.done, "failed": self._summary.failed})
@@ -226,6 +227,9 @@ class Runner:
         """Write down what became of jobs, then tell."""
         events = [self._event_of(job_id, outcome) for job_id, outcome in ended]
         self._journal.write(*events)
+        for job_id, outcome in ended:
+            if outcome.failure is not None:  # a worker that died cleared nothing away
+                clear_abandoned(self._out, self._journal.state.jobs[job_id].name)
         for (job_id, outcome), event in zip(ended, events, strict=True):
             self._flying.pop(job_id, None)
             if event["event"] == "done":

@@ -71,7 +71,7 @@ def _measured(order: Order, began: float) -> dict[str, object]:
         if order.job.kind == "session":
             text = _fill(order, calibration, _session(order), working, began)
         else:
-            with attempt_folder(order.out, "import") as place:
+            with attempt_folder(order.out, order.job.name) as place:
                 text = _fill(order, calibration, _imported(order, place), working, began)
         commit(working, result_folder(order.out, order.job.name))
     return facts_of_result(text)

@@ -36,11 +36,18 @@ def moody(order: Order) -> Outcome:
     return Outcome(0.0, "here", facts={"verdict": None, "marks": []})
 
 
+def dying_at_work(order: Order) -> Outcome:
+    """Ends in the middle of an attempt."""
+    with attempt_folder(order.out, order.job.name):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Outcome(0.0, "here")
+
+
 def light(order: Order) -> Outcome:
     """Reads everything and writes a result as the real work does, but makes no cloud."""
     try:
-        time.sleep(0.02)
         with attempt_folder(order.out, order.job.name) as working:
+            time.sleep(0.02)
             from drivers.files.session import read_scan, read_session
 
             session = read_session(order.job.source)

@@ -11,8 +11,9 @@ from drivers.errors import SettingsError
 from measure.jobs.dask_pool import require_loopback
 from measure.jobs.failures import TIMED_OUT, WORKER_DIED
 from measure.jobs.model import Files, Job, Order, Outcome, Recipe
+from measure.jobs.outputs import clear_abandoned, prepare
 from measure.jobs.pool import LocalPool
-from tests.support.job_works import moody
+from tests.support.job_works import dying_at_work, moody
 
 
 def order(part: str, out: Path) -> Order:
@@ -52,6 +53,19 @@ def test_dead_hanging_and_raising_workers_are_replaced(tmp_path: Path) -> None:
     assert "SIGKILL" in next(str(outcome.failure) for ticket, outcome in ended if ticket == "dies-1")
 
 
+def test_what_a_dead_worker_left_is_cleared_while_the_run_goes_on(tmp_path: Path) -> None:
+    prepare(tmp_path)
+    pool = LocalPool(1, dying_at_work)
+    try:
+        ended = done_by(pool, ["p"], tmp_path)
+    finally:
+        pool.close()
+    assert [outcome.failure is not None for _, outcome in ended] == [True]
+    assert len(list((tmp_path / "work").iterdir())) == 1
+    assert clear_abandoned(tmp_path, "another") == 0
+    assert clear_abandoned(tmp_path, order("p", tmp_path).job.name) == 1
+
+
 def break_down() -> None:
     raise RuntimeError("a broken installation")
 
@@ -73,9 +87,7 @@ def test_schedulers_of_this_computer_are_taken(address: str) -> None:
     require_loopback(address)
 
 
-@pytest.mark.parametrize(
-    "address", ["tcp://192.168.0.7:8786", "tcp://0.0.0.0:8786", "tcp://127.0.0.1", "127.0.0.1:8786", "tcp://x:y", ""]
-)
+@pytest.mark.parametrize("address", ["tcp://192.168.0.7:8786", "tcp://0.0.0.0:8786", "tcp://127.0.0.1", "127.0.0.1:8786", "tcp://x:y", ""])
 def test_other_schedulers_are_not(address: str) -> None:
     with pytest.raises(SettingsError, match="no scheduler on this computer"):
         require_loopback(address)

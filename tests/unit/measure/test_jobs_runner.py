@@ -323,7 +323,7 @@ def test_of_two_attempts_the_first_to_end_counts_and_the_living_are_not_cleared(
         assert commit(first, final)
         assert not commit(second, final)
     assert (final / "result.json").read_text(encoding="utf-8") == "first"
-    (tmp_path / "work" / "left.tmp").mkdir()
+    (tmp_path / "work" / "p-2.left.tmp").mkdir()
     assert clear_abandoned(tmp_path) == 1
     assert list((tmp_path / "work").iterdir()) == []
 
