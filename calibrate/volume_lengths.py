@@ -18,10 +18,14 @@ from drivers.kinematics.se3 import FloatArray
 _N_PLACES, _VIEWS = 14, 6
 _SHORTEST_SHARE = 0.25
 """Lengths shorter than this part of the longest tell nothing about the volume."""
+_ONE_PLACE_MM = 1.0
 
 
-def volume_length_uncertainty_mm(calibration: Calibration, work_volume_mm: FloatArray) -> float:
-    """Expanded uncertainty (k = 2) of the least certain length over a work volume (2, 3), noise of the shots averaged out."""
+def volume_length_uncertainty_mm(calibration: Calibration, work_volume_mm: FloatArray) -> float | None:
+    """Expanded uncertainty (k = 2) of the least certain length over a work volume (2, 3), noise of the shots averaged out.
+
+    None where the poses of the datum all point to one place: there is no length then.
+    """
     joints = calibration.datum.reference_joints_rad
     middle = np.broadcast_to(calibration.camera_seen_volume_mm.mean(axis=0), (len(joints), 3))
     seen = calibration.points_in_base_mm(middle, joints_rad=joints)
@@ -30,7 +34,9 @@ def volume_length_uncertainty_mm(calibration: Calibration, work_volume_mm: Float
     moved = [jacobian[np.argsort(np.linalg.norm(seen - seen[place], axis=1), kind="stable")[:_VIEWS]].mean(axis=0) for place in places]
     covariance = calibration.covariance[: jacobian.shape[-1], : jacobian.shape[-1]]
     ways = {(a, b): seen[places[b]] - seen[places[a]] for a, b in combinations(range(len(places)), 2)}
-    longest = max(float(np.linalg.norm(way)) for way in ways.values())
+    longest = max((float(np.linalg.norm(way)) for way in ways.values()), default=0.0)
+    if longest < _ONE_PLACE_MM:
+        return None
     variances = []
     for (a, b), way in ways.items():
         length = float(np.linalg.norm(way))
