@@ -29,7 +29,7 @@ from drivers.kinematics.se3 import FloatArray
 COLUMNS = ("what", "printed", "ours", "comparable", "why")
 _DATUM = "a datum: e_mean is mostly a shift of the base frame, which such data do not fix"
 _SPLIT = "last link and hand-eye are one displacement: how it is split is the solver's choice"
-_HARDWARE = "hardware: another camera error than the simulated one"
+_HARDWARE = "hardware: another camera error than the simulation's"
 _POSES = "other poses, which the paper does not give"
 _OTHER_SIGN = "ours with the other sign of k"
 _CERTIFIED = "certified"
@@ -57,7 +57,7 @@ def _diameters(panels: dict[str, Panel]) -> list[Row]:
     error = {label: np.concatenate([_y(p, label) - _y(p, _CERTIFIED) for p in panels.values()]) for label in (seen, other)}
     along = {axis: _y(panels[f"along {axis}"], other) for axis in "xyz"}
     change = {axis: f"{_trend(y)}, by {np.ptp(y):.3f} mm" for axis, y in along.items()}
-    sides = f"{_side(error[seen])} with the simulated k, {_side(error[other])} with the other sign"
+    sides = f"{_side(error[seen])} with the simulation's k, {_side(error[other])} with the other sign"
     largest = float(np.abs(error[other]).max())
     more = "eq. 5 gives another course: the hardware has errors beside it, as section 5 says"
     return [
