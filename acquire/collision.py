@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from acquire.arm_body import ArmBody
 from acquire.candidates import BoolArray
 from acquire.cell import Cell
-from acquire.obstacles import BoxObstacle, CylinderObstacle, MeshObstacle, Obstacle
-from drivers.errors import FileError
+from acquire.obstacles import BoxObstacle, CylinderObstacle, MeshObstacle, Obstacle, mesh_of
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import Capsule, RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -201,21 +200,10 @@ def _obstacle(obstacle: Obstacle, folder: Path) -> Any:
 def _mesh(obstacle: MeshObstacle, folder: Path) -> Any:
     """The triangles of a mesh: its surface only, so an arm wholly inside is not noticed."""
     import fcl
-    import trimesh
 
-    path = folder / obstacle.file
-    where = f"obstacle {obstacle.name!r}"
-    if not path.is_file():
-        raise FileError("no such mesh", file=path, where=where, remedy="Check the path; it starts from the folder of the cell file.")
-    try:
-        mesh = trimesh.load_mesh(str(path))
-        vertices, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    except Exception as error:  # its readers raise whatever they like on broken files
-        raise FileError(f"cannot be read as a mesh ({error})", file=path, where=where, remedy="Export it again as STL, PLY or OBJ.") from error
-    if len(triangles) == 0 or not np.isfinite(vertices).all():
-        raise FileError("holds no triangles", file=path, where=where, remedy="Export it again as a triangle mesh.")
+    vertices, triangles = mesh_of(obstacle, folder)
     model = fcl.BVHModel()
     model.beginModel(len(vertices), len(triangles))
-    model.addSubModel(vertices * obstacle.scale, triangles)
+    model.addSubModel(vertices, triangles)
     model.endModel()
     return model

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from drivers.errors import FileError
 from drivers.files.schema import Positive, StrictModel, Text, Vector3
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
@@ -51,3 +54,43 @@ class MeshObstacle(_Placed):
 
 
 Obstacle = Annotated[BoxObstacle | CylinderObstacle | MeshObstacle, Field(discriminator="kind")]
+
+
+def mesh_of(obstacle: MeshObstacle, folder: Path) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Vertices (v, 3) in its own frame, mm, and triangles (t, 3) of a mesh whose path starts from a folder.
+
+    Raises:
+        FileError: it cannot be read, or holds no triangles.
+    """
+    import trimesh
+
+    path, where = folder / obstacle.file, f"obstacle {obstacle.name!r}"
+    if not path.is_file():
+        raise FileError("no such mesh", file=path, where=where, remedy="Check the path; it starts from the folder of the cell file.")
+    try:
+        mesh = trimesh.load_mesh(str(path))
+        vertices, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    except Exception as error:  # its readers raise whatever they like on broken files
+        raise FileError(f"cannot be read as a mesh ({error})", file=path, where=where, remedy="Export it again as STL, PLY or OBJ.") from error
+    if len(triangles) == 0 or not np.isfinite(vertices).all():
+        raise FileError("holds no triangles", file=path, where=where, remedy="Export it again as a triangle mesh.")
+    return vertices * obstacle.scale, triangles
+
+
+def solid_of(obstacle: Obstacle, folder: Path) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Vertices (v, 3) in the base, mm, and triangles (t, 3) of the surface of any obstacle.
+
+    Raises:
+        FileError: as `mesh_of`.
+    """
+    import trimesh
+
+    if isinstance(obstacle, MeshObstacle):
+        vertices, triangles = mesh_of(obstacle, folder)
+    else:
+        if isinstance(obstacle, BoxObstacle):
+            mesh = trimesh.creation.box(extents=obstacle.size_mm)
+        else:
+            mesh = trimesh.creation.cylinder(radius=obstacle.diameter_mm / 2, height=obstacle.height_mm)
+        vertices, triangles = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    return se3.apply(obstacle.base_from_obstacle, vertices), triangles

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field
 
 from acquire.cell import Cell
 from acquire.check import beyond_limits_rad
+from acquire.obstacles import MeshObstacle
 from drivers.errors import FileError
 from drivers.files.disk import read_text, write_text_atomic
 from drivers.files.schema import Numbers, StrictModel, Text, check
@@ -48,6 +49,8 @@ class Plan:
     poses: tuple[PlannedPose, ...]
     predicted: Mapping[str, object] = field(default_factory=dict)
     """What the design expects, e.g. centre_rms_mm."""
+    part: MeshObstacle | None = None
+    """The workpiece that the poses cover, where it stands; its path starts from the cell file's folder."""
 
 
 def _as_tuple(value: object) -> object:
@@ -71,6 +74,7 @@ class _PlanFile(StrictModel):
     purpose: Literal["calibration", "verification", "workpiece"]
     poses: Annotated[tuple[_Pose, ...], BeforeValidator(_as_tuple)]
     predicted: dict[str, Any] = Field(default_factory=dict)
+    part: MeshObstacle | None = None
 
 
 def load_plan(path: str | Path, cell: Cell | None = None, model: RobotModel | None = None) -> Plan:
@@ -101,7 +105,7 @@ def parse_plan(text: str, *, file: str | Path, cell: Cell | None = None, model: 
         _check_joints(pose, poses[0], model, path, i)
     if cell is not None and cell.sha256 != content.cell_sha256:
         _LOG.warning("%s was made for another state of %s; spheres and limits were checked again.", path, cell.path)
-    return Plan(content.cell_sha256, content.purpose, poses, content.predicted)
+    return Plan(content.cell_sha256, content.purpose, poses, content.predicted, content.part)
 
 
 def plan_text(plan: Plan) -> str:
@@ -111,7 +115,15 @@ def plan_text(plan: Plan) -> str:
         for pose in plan.poses
     ]
     data: dict[str, object] = {"format": PLAN_FORMAT, "cell_sha256": plan.cell_sha256, "purpose": plan.purpose, "poses": poses}
-    return dump_yaml(data | ({"predicted": plan.predicted} if plan.predicted else {}))
+    part = {"part": plan.part.model_dump(mode="json", exclude_defaults=True)} if plan.part is not None else {}
+    return dump_yaml(data | part | ({"predicted": plan.predicted} if plan.predicted else {}))
+
+
+def with_part(cell: Cell, plan: Plan) -> Cell:
+    """The cell with the workpiece of a plan among its obstacles: neither arm nor camera may touch it."""
+    if plan.part is None or plan.part in cell.obstacles:
+        return cell
+    return cell.model_copy(update={"obstacles": (*cell.obstacles, plan.part)})
 
 
 def write_plan(plan: Plan, path: str | Path) -> None:

@@ -81,11 +81,12 @@ def capture(
     """Drive the robot through a plan and record a session. Ctrl-C pauses when the shot in hand is on disk, twice stops at once."""
     with command(as_json, debug, quiet) as run:
         from acquire.cell import load_cell, robot_model_of
-        from acquire.plan import load_plan
+        from acquire.plan import load_plan, with_part
         from drivers.errors import FileError
 
         loaded = load_cell(cell)
         poses = load_plan(plan, loaded, robot_model_of(loaded))
+        loaded = with_part(loaded, poses)
         settings = _settings(loaded, speed, warm_up)
         if dry_run:
             run.finish(_dry_run(run.console, loaded, poses, settings))

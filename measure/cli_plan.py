@@ -11,8 +11,13 @@ import typer
 from measure.cli_run import AsJson, Debug, EarlierCalibration, Quiet, command
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from acquire.cell import Cell
+    from acquire.obstacles import MeshObstacle
     from calibrate.design_shots import Expectation
     from measure.console import Console
+    from measure.covering import Coverage
     from measure.planning import PlanResult, Purpose
 
 
@@ -31,6 +36,7 @@ _PURPOSES: dict[For, Purpose] = {For.calibrate: "calibration", For.verify: "veri
 
 def plan(
     cell: Annotated[Path, typer.Argument(help="The cell file.")],
+    part: Annotated[Path | None, typer.Argument(help="For --for workpiece: the part to cover (STL, PLY, OBJ in mm).")] = None,
     n: Annotated[int | None, typer.Option("-n", min=1, help="Poses wanted, shared among the spheres; 40, for a check 8, if left out.")] = None,
     purpose: Annotated[For, typer.Option("--for", help="What the poses are for.")] = For.calibrate,
     out: Annotated[Path, typer.Option("--out", "-o", help="The plan to write.")] = Path("plan.yaml"),
@@ -38,6 +44,10 @@ def plan(
     region: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Box in the base, mm, for --for workpiece; the work volume if left out."),
+    ] = None,
+    placed: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(metavar="X Y Z RX RY RZ", help="The part's origin in the base, mm, and its turns about the base's x, y, z, degrees."),
     ] = None,
     start_deg: Annotated[
         str | None, typer.Option("--start", metavar="Q1,Q2,...", help="Where the robot stands before the run, axis angles in degrees.")
@@ -58,8 +68,18 @@ def plan(
         from measure.planning import PlanSettings, make_plan
 
         box = None if region is None else np.array(region).reshape(2, 3)
-        settings = PlanSettings(_PURPOSES[purpose], n or _POSES, tuple(sphere or ()), box, seed, expectation=_expectation(calibration))
-        result = make_plan(load_cell(cell), settings) if purpose is not For.check else _check_plan(cell, calibration, sphere or [], n, seed)
+        loaded = load_cell(cell)
+        settings = PlanSettings(
+            _PURPOSES[purpose],
+            n or _POSES,
+            tuple(sphere or ()),
+            box,
+            _part(loaded, part, placed, purpose),
+            seed,
+            None if start_deg is None else np.radians(_angles(start_deg)),
+            _expectation(calibration),
+        )
+        result = make_plan(loaded, settings) if purpose is not For.check else _check_plan(cell, calibration, sphere or [], n, seed)
         with replacing(out, PLAN_FORMAT) as former:
             write_plan(result.plan, out)
         if former is not None and former.exists():
@@ -78,6 +98,18 @@ def _check_plan(cell: Path, calibration: Path | None, spheres: list[str], n: int
         remedy = "Give --calibration calibration.yaml."
         raise SettingsError("a check is planned for the calibration that it checks", where="--calibration", remedy=remedy)
     return plan_check(load_cell(cell), Calibration.load(calibration), spheres, n or N_POSES, seed)
+
+
+def _part(cell: Cell, part: Path | None, placed: Sequence[float] | None, purpose: For) -> MeshObstacle | None:
+    from drivers.errors import SettingsError
+    from measure.covering import placed_part
+
+    if part is None and placed is None:
+        return None
+    if part is None or purpose is not For.workpiece:
+        remedy = "Use it as: plan CELL part.stl --for workpiece --placed X Y Z RX RY RZ."
+        raise SettingsError("a part and its place are for --for workpiece, both together", where="--placed", remedy=remedy)
+    return placed_part(cell, part, placed)
 
 
 def _angles(text: str) -> list[float]:
@@ -102,6 +134,8 @@ def _tell(console: Console, result: PlanResult, out: Path) -> None:
     vias = sum(len(pose.via_rad) for pose in result.plan.poses) - result.n_one_sided
     around = f", {vias} points to pass round what stands in the way" if vias else ""
     console.say(f"{len(result.plan.poses)} poses in {out}, {result.n_one_sided} reached from the same side{around}")
+    if result.coverage is not None:
+        _tell_coverage(console, result.coverage)
     length_mm, centre_mm = (result.plan.predicted.get(key) for key in ("length_rms_mm", "centre_rms_mm"))
     if length_mm is not None:
         centre = "" if centre_mm is None else f", centre of one view {centre_mm:.3f} mm"
@@ -111,3 +145,9 @@ def _tell(console: Console, result: PlanResult, out: Path) -> None:
         told = ", ".join(f"{name} {value:.1f}" for name, value in separations.items())
         console.say(f"how far each change stands out from the others, standard deviations: {told}")
         console.say(f"the run takes about {result.plan.predicted.get('seconds')} s at 3 s a scan")
+
+
+def _tell_coverage(console: Console, coverage: Coverage) -> None:
+    twice = f"of the surface {coverage.covered_fraction:.1%} is seen, {coverage.seen_twice_fraction:.1%} more than once"
+    rest = ", ".join(f"{reason} {share:.1%}" for reason, share in sorted(coverage.not_covered.items(), key=lambda item: -item[1]))
+    console.say(f"{twice}; not seen: {rest or 'nothing'}")

@@ -10,13 +10,13 @@ import numpy as np
 from acquire.capture_settings import planned_seconds, settings_of
 from acquire.cell import Cell
 from acquire.collision import cell_collisions
-from acquire.obstacles import BoxObstacle, CylinderObstacle, MeshObstacle, Obstacle
-from acquire.plan import Plan
+from acquire.obstacles import Obstacle, solid_of
+from acquire.plan import Plan, with_part
 from acquire.sweep import SweptWay, swept_ways, way_text
-from drivers.errors import FileError
-from drivers.kinematics import mdh, se3
+from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
+from measure.covering import views_of_triangles
 from measure.scene import PathMark, Scene, SolidMark, SphereMark, Step
 
 _SHOWN_STEP_RAD = np.radians(8.0)
@@ -47,6 +47,7 @@ def preview_of(plan: Plan, cell: Cell, model: RobotModel) -> Preview:
     Raises:
         FileError: a mesh of an obstacle cannot be read.
     """
+    cell = with_part(cell, plan)
     ways = swept_ways(plan.poses, cell_collisions(cell, model))
     seconds = planned_seconds(plan.poses, settings_of(cell))
     hand_eye = np.eye(4) if cell.flange_from_camera is None else np.asarray(cell.flange_from_camera, dtype=np.float64)
@@ -61,7 +62,7 @@ def preview_of(plan: Plan, cell: Cell, model: RobotModel) -> Preview:
         shape=model.shape,
         field_of_view_deg=(cell.camera.field_of_view_deg or _DEFAULT_VIEW_DEG) if is_area else None,
         depth_mm=depth,
-        solids=tuple(_solid(obstacle, cell) for obstacle in cell.obstacles),
+        solids=tuple(_solid(obstacle, plan, cell, model) for obstacle in cell.obstacles),
         paths=_paths(ways, model, hand_eye),
     )
     return Preview(scene, ways, seconds)
@@ -90,22 +91,12 @@ def _paths(ways: Sequence[SweptWay], model: RobotModel, hand_eye: FloatArray) ->
     return (PathMark("camera", (flange @ hand_eye)[:, :3, 3], touches), PathMark("flange", flange[:, :3, 3], touches))
 
 
-def _solid(obstacle: Obstacle, cell: Cell) -> SolidMark:
-    import trimesh
-
-    if isinstance(obstacle, BoxObstacle):
-        mesh = trimesh.creation.box(extents=obstacle.size_mm)
-    elif isinstance(obstacle, CylinderObstacle):
-        mesh = trimesh.creation.cylinder(radius=obstacle.diameter_mm / 2, height=obstacle.height_mm)
-    else:
-        path = cell.folder / obstacle.file
-        try:
-            mesh = trimesh.load_mesh(str(path))
-        except Exception as error:  # its readers raise whatever they like on broken files
-            raise FileError(f"cannot be read as a mesh ({error})", file=path, remedy="Export it again as STL, PLY or OBJ.") from error
-    scale = obstacle.scale if isinstance(obstacle, MeshObstacle) else 1.0
-    vertices = se3.apply(obstacle.base_from_obstacle, scale * np.asarray(mesh.vertices, dtype=np.float64))
-    return SolidMark(obstacle.name, vertices, np.asarray(mesh.faces, dtype=np.int64))
+def _solid(obstacle: Obstacle, plan: Plan, cell: Cell, model: RobotModel) -> SolidMark:
+    """An obstacle, or the plan's part coloured by the poses that see it."""
+    sees = cell.flange_from_camera is not None and cell.camera.working_range_mm is not None and cell.camera.field_of_view_deg is not None
+    if obstacle != plan.part or not sees:
+        return SolidMark(obstacle.name, *solid_of(obstacle, cell.folder))
+    return SolidMark(obstacle.name, *views_of_triangles(plan, cell, model))
 
 
 def _aim(way: SweptWay) -> str:
@@ -121,6 +112,7 @@ def _summary(plan: Plan, cell: Cell, ways: Sequence[SweptWay], seconds: float) -
         f"purpose **{plan.purpose}**, about {seconds / 60:.0f} min at {cell.motion.speed_rad_s:g} rad/s",
         "",
         "Drag the time slider: the arm goes from pose to pose, straight in axis angles and over the via points, by the nominal robot.",
+        *(["The part: red is seen by no pose, amber by one, green by two, teal by three and more.", ""] if plan.part is not None else []),
         "Green lines: ways of the camera and of the flange. Red: something is touched there, margins included.",
         "",
         f"Obstacles of the cell file: {known}. What stands in no file (sphere stands, cables, people) is not seen.",

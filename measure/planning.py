@@ -15,14 +15,16 @@ import numpy as np
 
 from acquire.cell import Cell, robot_model_of
 from acquire.collision import CollisionCheck, cell_collisions
+from acquire.obstacles import MeshObstacle
 from acquire.ordering import choose_spread, unwound
-from acquire.plan import Plan, PlannedPose
+from acquire.plan import Plan, PlannedPose, with_part
 from acquire.poses import DEFAULT_LAW, CandidatePool, sphere_candidates, workpiece_poses
 from acquire.routing import route
 from acquire.visibility import CameraView, camera_view
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics.mdh import RobotModel, within_limits
 from drivers.kinematics.se3 import FloatArray
+from measure.covering import Coverage, coverage_of, part_pool
 
 if TYPE_CHECKING:
     from calibrate.design_shots import Expectation
@@ -52,6 +54,8 @@ class PlanSettings:
     """All spheres of known place if empty."""
     region_mm: FloatArray | None = None
     """(2, 3) box in the base that workpiece poses cover; the cell's work volume if None."""
+    part: MeshObstacle | None = None
+    """Whose surface workpiece poses cover, instead of a box."""
     seed: int = 0
     start_rad: FloatArray | None = None
     """(n,) where the robot stands before the run; None if nobody knows."""
@@ -69,6 +73,8 @@ class PlanResult:
     rejected: Mapping[str, int] = field(default_factory=dict)
     n_one_sided: int = 0
     """Poses that are reached by turning every axis forwards."""
+    coverage: Coverage | None = None
+    """Of the part, where there is one."""
 
     def to_json_dict(self) -> Mapping[str, object]:
         """What `spherecal plan --json` prints; predictions are null but for calibrations."""
@@ -78,7 +84,8 @@ class PlanResult:
             "rejected": self.rejected,
             "poses": [{"id": p.id, "sphere": p.sphere, "joints_rad": p.joints_rad, "via_rad": p.via_rad} for p in self.plan.poses],
             "n_one_sided": self.n_one_sided,
-            "predicted": {"centre_rms_mm": None, "length_rms_mm": None} | dict(self.plan.predicted),
+            **({} if self.coverage is None else {"coverage": self.coverage.to_json_dict()}),
+            "predicted": {"centre_rms_mm": None, "length_rms_mm": None} | {k: v for k, v in self.plan.predicted.items() if k != "coverage"},
         }
 
 
@@ -92,6 +99,8 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
     """
     model, flange_from_camera = needed_of(cell)
     _check_start(settings.start_rad, model)
+    if settings.purpose == "workpiece" and settings.part is not None:
+        return _covering(cell, settings, settings.part, model, flange_from_camera)
     rng = np.random.default_rng([settings.seed, _STREAM[settings.purpose]])
     view, check = camera_view(cell.camera), cell_collisions(cell, model)
     pools: list[tuple[str | None, CandidatePool]] = []
@@ -105,6 +114,17 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
     if settings.purpose == "calibration":
         return _result(cell, settings, model, check, *_designed(cell, model, pools, settings, rng))
     return _result(cell, settings, model, check, pools)
+
+
+def _covering(cell: Cell, settings: PlanSettings, part: MeshObstacle, model: RobotModel, flange_from_camera: FloatArray) -> PlanResult:
+    """A plan that covers a part."""
+    full = with_part(cell, Plan(cell.sha256, "workpiece", (), part=part))
+    rng, check = np.random.default_rng([settings.seed, _STREAM["workpiece"]]), cell_collisions(full, model)
+    pool, cover = part_pool(full, part, settings.n_poses, model, flange_from_camera, camera_view(cell.camera), check, rng)
+    result = _result(full, settings, model, check, [(None, pool)])
+    plan = replace(result.plan, part=part)
+    coverage = coverage_of(plan, cell, model, cover)
+    return replace(result, plan=replace(plan, predicted={"coverage": coverage.to_json_dict()}), coverage=coverage)
 
 
 def _designed(

@@ -61,6 +61,8 @@ class SolidMark:
     """(n, 3)."""
     triangles: NDArray[np.int64]
     """(m, 3) rows of the vertices."""
+    views: NDArray[np.int64] | None = None
+    """(m,) how many poses see each triangle, to colour it by; None for one colour."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
 PATH_COLOUR, TOUCHING_COLOUR, SOLID_COLOUR = (120, 190, 90), (230, 40, 30), (170, 150, 120, 255)
+VIEWS_COLOURS = ((200, 60, 50), (235, 180, 60), (150, 200, 90), (60, 150, 130))
+"""Of a part: seen by no pose, one, two, three or more."""
 _MM = 1e-3
 
 
@@ -32,7 +34,12 @@ def _log_solid(stream: rr.RecordingStream, entity: str, solid: SolidMark) -> Non
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     unit = np.repeat(normals / np.where(length > 0, length, 1), 3, axis=0)
-    stream.log(entity, rr.Mesh3D(vertex_positions=corners.reshape(-1, 3), vertex_normals=unit, albedo_factor=SOLID_COLOUR), static=True)
+    if solid.views is None:
+        mesh = rr.Mesh3D(vertex_positions=corners.reshape(-1, 3), vertex_normals=unit, albedo_factor=SOLID_COLOUR)
+    else:
+        colours = np.array(VIEWS_COLOURS, dtype=np.uint8)[np.minimum(solid.views, len(VIEWS_COLOURS) - 1)]
+        mesh = rr.Mesh3D(vertex_positions=corners.reshape(-1, 3), vertex_normals=unit, vertex_colors=np.repeat(colours, 3, axis=0))
+    stream.log(entity, mesh, static=True)
     label = rr.Points3D([corners.reshape(-1, 3).mean(axis=0)], labels=[solid.name], radii=-1.0, colors=SOLID_COLOUR)
     stream.log(f"{entity}/name", label, static=True)
 

@@ -10,16 +10,17 @@ import numpy as np
 from acquire.candidates import CandidatePool
 from acquire.cell import Cell
 from acquire.collision import cell_collisions
-from acquire.ordering import order_by_travel
+from acquire.ordering import unwound
 from acquire.plan import Plan, PlannedPose
 from acquire.poses import PoseLaw, sphere_candidates
+from acquire.routing import route
 from acquire.visibility import camera_view
 from calibrate.check_design import LARGEST_TILT_RAD, CheckDesign, choose_check_poses
 from calibrate.result import Calibration
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
-from measure.planning import PlanResult
+from measure.planning import NO_WAY, PlanResult
 
 N_POSES = 8
 _CANDIDATES = 280
@@ -56,18 +57,24 @@ def plan_check(cell: Cell, calibration: Calibration, spheres: Sequence[str], n: 
     at = [name for name, pool in zip(names, pools, strict=True) for _ in pool.view]
     radius = {name: cell.spheres[name].radius_mm for name in names}
     design = _chosen(calibration, joints.round(6), at, n, rng, radius)
-    order = design.rows[order_by_travel(joints[design.rows])]
-    poses = tuple(PlannedPose(f"{i:03d}", at[row], joints[row].round(6)) for i, row in enumerate(order, start=1))
+    chosen = unwound(model, joints[design.rows]).round(6)
+    ways = route(model, cell_collisions(cell, model), chosen)
+    order = list(ways.rows)
+    poses = tuple(
+        PlannedPose(f"{i:03d}", at[design.rows[row]], chosen[row], vias)
+        for i, (row, vias) in enumerate(zip(order, ways.via_rad, strict=True), start=1)
+    )
     rejected: Counter[str] = Counter()
     for pool in pools:
         rejected.update(pool.rejected)
+    rejected.update({NO_WAY: len(ways.lost)} if ways.lost else {})
     drawn = sum(pool.n_candidates for pool in pools)
     predicted = {
         "separation_sigmas": {name: round(value, 2) for name, value in design.separations.items()},
-        "seconds": round(seconds_of(cell, joints[order]), 1),
+        "seconds": round(seconds_of(cell, chosen[order]), 1),
         "note": _NOTE,
     }
-    return PlanResult(Plan(cell.sha256, "verification", poses, predicted), drawn, drawn - rejected.total(), dict(rejected))
+    return PlanResult(Plan(cell.sha256, "verification", poses, predicted), drawn, drawn - rejected.total(), dict(rejected), ways.n_one_sided)
 
 
 def seconds_of(cell: Cell, joints_rad: FloatArray) -> float:
