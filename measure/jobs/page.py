@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 PAGE = "throughput.html"
 _HOURS = 48
 _BINS = 24
-_MOST_ROWS = 50
+_MOST_ROWS = 25
 _HOUR_S = 3600.0
 
 
