@@ -43,6 +43,11 @@ def dying_at_work(order: Order) -> Outcome:
     return Outcome(0.0, "here")
 
 
+def moody_at_work(order: Order) -> Outcome:
+    """As `light`, but parts called `dies` end their worker in the middle of it."""
+    return dying_at_work(order) if order.job.part.startswith("dies") else light(order)
+
+
 def light(order: Order) -> Outcome:
     """Reads everything and writes a result as the real work does, but makes no cloud."""
     try:

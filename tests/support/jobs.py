@@ -153,11 +153,12 @@ def run_jobs(
     history: str | None = None,
     on_made: Callable[[Runner], None] | None = None,
     retry_dead: bool = False,
+    retries: int = 3,
     memory_mb: float | None = None,
     give_up_after_s: float = 3600.0,
 ) -> Summary:
     """Drain a folder in this process."""
-    settings = RunSettings(once=True, settle_s=0.0, poll_s=0.01, back_off_s=0.01, history=history, retry_dead=retry_dead)
+    settings = RunSettings(once=True, settle_s=0.0, poll_s=0.01, back_off_s=0.01, history=history, retry_dead=retry_dead, retries=retries)
     settings = replace(settings, memory_mb=memory_mb, give_up_after_s=give_up_after_s)
     prepare(out)
     copy, _ = keep_copy(out, parts.calibration)

@@ -19,7 +19,10 @@ import pytest
 
 from drivers.files.ply import read_ply
 from drivers.files.session import read_session
-from tests.support.jobs import Parts, make_parts, truncate_scan
+from measure.jobs.dask_pool import DaskPool
+from measure.jobs.failures import WORKER_DIED
+from tests.support.job_works import moody_at_work
+from tests.support.jobs import Parts, make_parts, run_jobs, truncate_scan
 from tests.support.source import ROOT
 
 PATIENCE_S = 1200.0
@@ -172,6 +175,25 @@ def test_a_thousand_jobs_with_kills(tmp_path: Path, n_parts: int, where: str) ->
     kinds = [event["event"] for event in events(out)]
     seconds = time.monotonic() - began
     print(f"{n_parts} jobs by {where} in {seconds:.0f} s, {kinds.count('interrupted')} interrupted, {kinds.count('failed')} failed attempts")
+
+
+@pytest.mark.qualify
+def test_a_job_that_kills_every_dask_worker_is_given_up_and_the_others_done(tmp_path: Path) -> None:
+    made = make_parts(tmp_path, 4, 0, seed=12)
+    (made.folder / made.good[1]).rename(made.folder / "dies-1")
+    good = tuple(sorted({*made.good} - {made.good[1]}))
+    parts = Parts(made.folder, made.calibration, good, {"dies-1": "kills its worker"})
+    with dask_cluster(tmp_path, 2) as address:
+        pool = DaskPool(address, moody_at_work, timeout_s=300.0)
+        try:
+            summary = run_jobs(parts, tmp_path / "out", pool, retries=0)
+        finally:
+            pool.close()
+    assert (summary.done, summary.failed) == (3, 1)
+    assert [letter["category"] for letter in summary.dead_letters] == [WORKER_DIED]
+    assert "KilledWorker" in str(summary.dead_letters[0]["reason"])
+    assert {path.name.rpartition("-")[0] for path in (tmp_path / "out" / "results").iterdir()} == set(good)
+    assert list((tmp_path / "out" / "work").iterdir()) == []
 
 
 def go_through(parts: Parts, out: Path, run: Sequence[str]) -> None:
