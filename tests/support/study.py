@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
+import pytest
 
 from calibrate.study import Study, StudySettings, run_study
+from tests.support.once import once_a_run
 
 TINY = StudySettings(
     seed=5,
@@ -19,7 +20,6 @@ TINY = StudySettings(
 )
 
 
-@cache
-def tiny_study() -> Study:
-    """Computed once for all tests of a process: they only look at it."""
-    return run_study(TINY)
+def tiny_study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """Computed once for all tests of a run: they only look at it."""
+    return once_a_run(tmp_path_factory, "tiny_study", lambda _folder: run_study(TINY))

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.support.unseen import random_unseen_lengths
 
-N_SEEDS, N_LENGTHS = 5, 10
+N_SEEDS, N_LENGTHS = 3, 16
 
 
 def test_intervals_of_unseen_lengths_cover(tmp_path: Path) -> None:

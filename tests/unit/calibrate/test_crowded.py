@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.support.crowded import SPOILS, CrowdedResult, CrowdedSession, solve_crowded, write_crowded_session
+from tests.support.once import once_a_run
 
 SEED = 4
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> CrowdedSession:
-    return write_crowded_session(tmp_path_factory.mktemp("crowded") / "s", SEED, n_shots=54, resolution_px=(240, 150))
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[CrowdedSession, CrowdedResult]:
+    return once_a_run(tmp_path_factory, "crowded", write_and_solve)
+
+
+def write_and_solve(folder: Path) -> tuple[CrowdedSession, CrowdedResult]:
+    session = write_crowded_session(folder / "s", SEED, n_shots=54, resolution_px=(240, 150))
+    return session, solve_crowded(session, ("auto", "pillow"), SEED, n_tests=30)
 
 
 @pytest.fixture(scope="module")
-def result(session: CrowdedSession) -> CrowdedResult:
-    return solve_crowded(session, ("auto", "pillow"), SEED, n_tests=30)
+def session(both: tuple[CrowdedSession, CrowdedResult]) -> CrowdedSession:
+    return both[0]
+
+
+@pytest.fixture(scope="module")
+def result(both: tuple[CrowdedSession, CrowdedResult]) -> CrowdedResult:
+    return both[1]
 
 
 def test_every_spoiled_shot_is_rejected_with_a_reason_and_hardly_another(session: CrowdedSession, result: CrowdedResult) -> None:

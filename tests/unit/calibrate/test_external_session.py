@@ -15,6 +15,7 @@ from drivers.errors import DataError, FileError, SettingsError
 from drivers.files.session import read_session
 from drivers.kinematics import mdh, se3
 from drivers.simulated.truth import RobotTruth
+from tests.support.once import once_a_run
 from tests.support.solving import draw_shots
 from tests.support.synthetic import SyntheticShot, abb_robot, paper_cell, with_table_1_errors
 from tests.support.synthetic_session import write_session
@@ -177,10 +178,14 @@ def mixed_cell() -> tuple[TrackedRobot, dict[str, list[SyntheticShot]]]:
 @pytest.fixture(scope="module")
 def together(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Calibration, float]]:
     """The same robot by spheres, by a tracker, and by both, with the error of its unseen poses."""
+    return once_a_run(tmp_path_factory, "together", calibrate_together)
+
+
+def calibrate_together(folder: Path) -> dict[str, tuple[Calibration, float]]:
+    """All four from sessions in a folder."""
     robot, spheres = mixed_cell()
     rng = np.random.default_rng(53)
     shots = robot.shots(rng, 24)
-    folder = tmp_path_factory.mktemp("mixed")
     cell = paper_cell(coupled=True)
     found = {
         "spheres": write_session(folder / "spheres", cell, spheres, flange_from_camera=None, extra_cell={"limits": LIMITS}),

@@ -9,18 +9,23 @@ import pytest
 
 from calibrate.predict import Artefact, ArtefactPrediction, artefacts_of, box_of, own_artefact, predict_artefact, ranked, usual_artefacts
 from drivers.errors import SettingsError
+from tests.support.once import once_a_run
 from tests.support.solving import one_thread
 from tests.support.volume import volume_cell
 
-N_SHOTS = 60
+N_SHOTS = 36
 
 
-@pytest.fixture(scope="module")
-def found() -> dict[str, ArtefactPrediction]:
+def predict_all() -> dict[str, ArtefactPrediction]:
     volume = volume_cell(0)
     with one_thread():
         groups = [predict_artefact(volume.cell, volume.model, artefact, (N_SHOTS,)) for artefact in artefacts_of(volume.cell, ["A", "B"])]
     return {p.artefact.name: p for p in ranked(groups)}
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ArtefactPrediction]:
+    return once_a_run(tmp_path_factory, "predictions", lambda _folder: predict_all())
 
 
 def length_rms_mm(prediction: ArtefactPrediction) -> float:

@@ -15,8 +15,8 @@ METHODS = ("1", "2", "3", "4")
 
 
 @pytest.fixture(scope="module")
-def study() -> Study:
-    return tiny_study()
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    return tiny_study(tmp_path_factory)
 
 
 def number(cell: Cell) -> float:

@@ -18,19 +18,18 @@ from measure.cli import app
 from measure.cli_run import run_app
 from measure.study_page import PAGE, is_study, write_study
 from measure.study_text import SECTIONS
+from tests.support.once import once_a_run
 from tests.support.study import tiny_study
 
 
 @pytest.fixture(scope="module")
-def study() -> Study:
-    return tiny_study()
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    return tiny_study(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
 def folder(study: Study, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("study")
-    write_study(study, made)
-    return made
+    return once_a_run(tmp_path_factory, "study_page", lambda made: write_study(study, made).parent)
 
 
 class Reader(HTMLParser):
