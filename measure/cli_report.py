@@ -22,7 +22,11 @@ AnySessions = Annotated[list[Path] | None, typer.Argument(help="Session folders.
 def report(
     calibration: CalibrationFile,
     sessions: AnySessions = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The page to write; the same as JSON goes beside it.")] = Path("report.html"),
+    pdf: Annotated[Path | None, typer.Option("--pdf", help="Write the page as PDF too.")] = None,
+    beside: Annotated[
+        list[Path] | None, typer.Option("--beside", help="Another calibration (e.g. by --method stepwise) to judge on the same unseen shots. Repeat.")
+    ] = None,
     as_json: AsJson = False,
     debug: Debug = False,
     quiet: Quiet = False,
@@ -36,16 +40,24 @@ def report(
         from measure.report import write_report
         from measure.verify import verify
 
-        require_writable(out)
+        for path in (out, *([] if pdf is None else [pdf])):
+            require_writable(path)
         loaded = Calibration.load(calibration)
         read = [read_session(folder) for folder in sessions or []]
         unseen = [session for session in read if not is_training(loaded, session)]
         result = verify(loaded, unseen) if unseen else None
         cell = cell_of_session(read[0]) if read else None
-        write_report(out, loaded, result, cell=cell, session_names={session.digest: session.folder.name for session in read})
-        run.console.say(f"{out} written")
+        named = [(name_of(path, other), verify(other, unseen)) for path, other in ((p, Calibration.load(p)) for p in beside or [])] if unseen else []
+        names = {session.digest: session.folder.name for session in read}
+        write_report(out, loaded, result, cell=cell, session_names=names, others=named, pdf=pdf)
+        run.console.say(f"{out} written" if pdf is None else f"{out} and {pdf} written")
         verdict = loaded.verdict if result is None else result.verdict
-        run.finish({"out": out, "verdict": verdict, "verified": result is not None})
+        run.finish({"out": out, "json": out.with_suffix(".json"), "pdf": pdf, "verdict": verdict, "verified": result is not None})
+
+
+def name_of(path: Path, calibration: Calibration) -> str:
+    """What a calibration is called beside others."""
+    return f"{path.stem} ({calibration.method}, {calibration.camera_error.name})"
 
 
 def show(

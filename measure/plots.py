@@ -56,7 +56,7 @@ class ShotSeries:
     colour: str
 
 
-def centres_svg(before_mm: FloatArray | None, after_mm: FloatArray, *, axes: tuple[int, int]) -> str:
+def centres_svg(before_mm: FloatArray | None, after_mm: FloatArray, *, axes: tuple[int, int]) -> Drawn:
     """Sphere centres about their sphere's mean, before (m, 3) and after (n, 3), looked at along the third axis."""
     names = "xyz"
 
@@ -73,7 +73,7 @@ def centres_svg(before_mm: FloatArray | None, after_mm: FloatArray, *, axes: tup
     return svg_of(draw, salt=f"centres{axes}", size=(6.4, 3.3))
 
 
-def shots_svg(series: Sequence[ShotSeries], *, rejected: FloatArray, ylabel: str, limit_mm: float | None = None) -> str:
+def shots_svg(series: Sequence[ShotSeries], *, rejected: FloatArray, ylabel: str, limit_mm: float | None = None) -> Drawn:
     """One stem per shot over the shot number; rejected shots (k,) marked on the axis, an optional limit as a line."""
 
     def draw(figure: Any) -> None:
@@ -96,7 +96,7 @@ def shots_svg(series: Sequence[ShotSeries], *, rejected: FloatArray, ylabel: str
 
 def coverage_svg(
     groups: Mapping[str, tuple[FloatArray, str]], *, axis: int, working_range_mm: tuple[float, float] | None, seen_mm: FloatArray | None
-) -> str:
+) -> Drawn:
     """Sphere centres in the camera frame: one lateral axis (0 or 1) over depth, one colour per group (n, 3).
 
     `seen_mm` (2, 3) is the box that the camera error model has data for.
@@ -123,7 +123,7 @@ def coverage_svg(
     return svg_of(draw, salt=f"coverage{axis}", size=(4.6, 4.6))
 
 
-def lengths_svg(after: Sequence[LengthBar], before: Mapping[str, float], *, limit_mm: float | None) -> str:
+def lengths_svg(after: Sequence[LengthBar], before: Mapping[str, float], *, limit_mm: float | None) -> Drawn:
     """Length errors with U (k = 2) as bars, the uncalibrated error beside each, the limit as a band."""
 
     def draw(figure: Any) -> None:
@@ -164,17 +164,40 @@ def legend_above(axis: Any, columns: int) -> None:
     axis.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, borderaxespad=0.2, handletextpad=0.4, columnspacing=1.0)
 
 
-def svg_of(draw: Callable[[Any], None], *, salt: str, size: tuple[float, float]) -> str:
+class Drawn(str):
+    """An SVG text that knows how it was drawn, for files that hold pictures in another form."""
+
+    draw: Callable[[Any], None]
+    size_inch: tuple[float, float]
+
+
+def svg_of(draw: Callable[[Any], None], *, salt: str, size: tuple[float, float]) -> Drawn:
     """The SVG of what `draw` puts on a figure of its own; ids carry the salt, since several pictures share one page."""
-    import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
 
     stream = io.StringIO()
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": salt}):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasSVG(figure)
-        draw(figure)
-        figure.savefig(stream, format="svg", metadata={"Date": None}, transparent=True)
+    _save(draw, size, FigureCanvasSVG, stream, {"svg.hashsalt": salt}, format="svg", metadata={"Date": None}, transparent=True)
     text = stream.getvalue()
-    return text[text.index("<svg") :]
+    drawn = Drawn(text[text.index("<svg") :])
+    drawn.draw, drawn.size_inch = draw, size
+    return drawn
+
+
+def png_of(drawn: Drawn, *, dots_per_inch: int = 170) -> bytes:
+    """The same picture as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    stream = io.BytesIO()
+    _save(drawn.draw, drawn.size_inch, FigureCanvasAgg, stream, {}, format="png", metadata={"Software": None}, dpi=dots_per_inch)
+    return stream.getvalue()
+
+
+def _save(draw: Callable[[Any], None], size: tuple[float, float], canvas: Any, stream: Any, style: dict[Any, Any], **options: Any) -> None:
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({**_STYLE, **style}):
+        figure = Figure(figsize=size, layout="constrained")
+        canvas(figure)
+        draw(figure)
+        figure.savefig(stream, **options)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.camera_field import CameraField
-from measure.plots import AFTER_COLOUR, FloatArray, legend_above, svg_of
+from measure.plots import AFTER_COLOUR, Drawn, FloatArray, legend_above, svg_of
 
 _UNSEEN_COLOUR = "#9ca3af"
 _LEVELS = 12
@@ -63,7 +63,7 @@ def grid_mm(x_mm: FloatArray, y_mm: FloatArray, depth_mm: float) -> FloatArray:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, depth_mm)], axis=-1)
 
 
-def depth_slices_svg(slices: Sequence[DepthSlice]) -> str:
+def depth_slices_svg(slices: Sequence[DepthSlice]) -> Drawn:
     """Depth error above, its U (k = 2) below, one column a depth; hatched where no shot measured."""
 
     def draw(figure: Any) -> None:
@@ -91,7 +91,7 @@ def depth_slices_svg(slices: Sequence[DepthSlice]) -> str:
     return svg_of(draw, salt="depth slices", size=(8.6, 4.1))
 
 
-def depth_profiles_svg(profiles: Sequence[DepthProfile]) -> str:
+def depth_profiles_svg(profiles: Sequence[DepthProfile]) -> Drawn:
     """Depth error along z with U (k = 2) as bands; dotted where no shot measured."""
 
     def draw(figure: Any) -> None:
@@ -109,7 +109,7 @@ def depth_profiles_svg(profiles: Sequence[DepthProfile]) -> str:
     return svg_of(draw, salt="depth profiles", size=(6.4, 3.2))
 
 
-def budget_map_svg(x_mm: FloatArray, y_mm: FloatArray, total_mm: FloatArray) -> str:
+def budget_map_svg(x_mm: FloatArray, y_mm: FloatArray, total_mm: FloatArray) -> Drawn:
     """Standard uncertainty of a point (ny, nx) over the plan of the work volume; blank out of reach."""
 
     def draw(figure: Any) -> None:

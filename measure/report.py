@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -15,11 +16,14 @@ from calibrate.result import Calibration
 from drivers.files.disk import write_text_atomic
 from drivers.kinematics.se3 import FloatArray
 from measure import plots
+from measure.console import json_text
 from measure.plots import AFTER_COLOUR, LengthBar, ShotSeries
 from measure.proof.tables import proof_tables
-from measure.report_facts import facts_of
+from measure.report_facts import facts_of, folders_of
 from measure.report_insight import budget_pictures, budget_tables, field_pictures, field_tables, identifiability_tables
 from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual, Table
+from measure.report_pdf import write_pdf
+from measure.report_tables import beside_table, report_data, shots_table
 from measure.report_text import (
     calibration_rows,
     decision_text,
@@ -44,8 +48,10 @@ def write_report(
     *,
     cell: Cell | None = None,
     session_names: Mapping[str, str] | None = None,
+    others: Sequence[tuple[str, VerifyResult]] = (),
+    pdf: str | Path | None = None,
 ) -> Path:
-    """Write the report of a calibration, with or without a verification; returns the path.
+    """Write the report of a calibration, with or without a verification, and the same for machines (.json) beside it; returns the path.
 
     Args:
         path: the HTML file; it appears whole or not at all.
@@ -53,27 +59,46 @@ def write_report(
         verification: on shots that it never saw.
         cell: for the camera's working range, and whether the cell is simulated.
         session_names: names of the calibration's sessions by their digest, instead of their folders.
+        others: name and verification of other calibrations, on the same shots.
+        pdf: write the page as PDF too.
 
     Raises:
         FileError: the folder is missing or not writable.
     """
-    return write_page(path, facts_of(calibration, cell, session_names), verification)
+    names = {**folders_of(calibration.inputs), **(session_names or {})}
+    more = (*beside_table(verification, others), *shots_table(calibration.shots, names))
+    write_text_atomic(Path(path).with_suffix(".json"), json_text(report_data(calibration, verification, others)) + "\n")
+    return write_page(path, facts_of(calibration, cell, session_names), verification, more=more, pdf=pdf)
 
 
-def write_page(path: str | Path, facts: CalibrationFacts, verification: VerifyResult | None = None, *, now: datetime.datetime | None = None) -> Path:
+def write_page(
+    path: str | Path,
+    facts: CalibrationFacts,
+    verification: VerifyResult | None = None,
+    *,
+    more: tuple[Table, ...] = (),
+    pdf: str | Path | None = None,
+    now: datetime.datetime | None = None,
+) -> Path:
     """Write a report from plain facts; returns the path.
 
     Args:
         path: the HTML file; it appears whole or not at all.
         facts: what to say of the calibration.
         verification: on shots that it never saw.
+        more: further tables.
+        pdf: write the page as PDF too.
         now: date printed on the page; the present if None.
 
     Raises:
         FileError: the folder is missing or not writable.
     """
     moment = now or datetime.datetime.now(datetime.UTC)
-    write_text_atomic(path, render(page_of(facts, verification, moment)))
+    page = page_of(facts, verification, moment)
+    page = replace(page, tables=(*page.tables, *more))
+    write_text_atomic(path, render(page))
+    if pdf is not None:
+        write_pdf(pdf, page)
     return Path(path)
 
 

@@ -26,7 +26,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         cell: for the camera's working range, and whether the cell is simulated.
         session_names: names by digest, instead of the folders that the calibration names.
     """
-    names = {**_folders(calibration.inputs), **(session_names or {})}
+    names = {**folders_of(calibration.inputs), **(session_names or {})}
     statistics = calibration.statistics
     return CalibrationFacts(
         id=calibration.id,
@@ -85,7 +85,7 @@ def _is_simulated(calibration: Calibration, cell: Cell | None) -> bool:
     return "simulated" in {*drivers, *(str(value) for value in calibration.identity.values())}
 
 
-def _folders(inputs: Mapping[str, object]) -> dict[str, str]:
+def folders_of(inputs: Mapping[str, object]) -> dict[str, str]:
     """Folder names of the calibration's sessions by digest, as far as its inputs tell them."""
     sessions = inputs.get("sessions")
     rows = [row for row in sessions if isinstance(row, Mapping)] if isinstance(sessions, list | tuple) else []

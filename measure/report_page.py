@@ -10,6 +10,7 @@ from calibrate.budget import ErrorBudget
 from calibrate.camera_field import CameraField, SeenCells
 from calibrate.identifiability import Identifiability
 from drivers.kinematics.se3 import FloatArray
+from measure.plots import Drawn
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +98,7 @@ class Picture:
 
     title: str
     caption: str
-    svg: str
+    svg: Drawn
     wide: bool = False
     """Whether it takes the whole width of the page."""
 

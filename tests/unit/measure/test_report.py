@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -85,6 +86,20 @@ def test_the_page_needs_nothing_but_itself(calibration: Calibration, verificatio
     links = re.findall(r'(?:href|src)="([^"]*)"', html) + re.findall(r"url\(([^)]*)\)", html)
     assert all(link.startswith(("#", "data:")) for link in links)
     assert html.count("<svg") == 8
+
+
+def test_the_same_goes_to_machines_and_other_calibrations_stand_beside(
+    calibration: Calibration, verification: VerifyResult, cell: Cell, tmp_path: Path
+) -> None:
+    path = write_report(tmp_path / "report.html", calibration, verification, cell=cell, others=[("by <hand>", verification)])
+    data = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    assert data["format"] == "spherecal-report/1"
+    assert data["verification"]["verdict"] == verification.verdict
+    assert len(data["calibration"]["shots"]) == len(calibration.shots)
+    assert list(data["others"]) == ["by <hand>"]
+    text, _ = read(path)
+    assert "by <hand>" in text
+    assert "Every shot of the calibration" in text
 
 
 def test_it_says_what_was_found(calibration: Calibration, verification: VerifyResult, cell: Cell, session: Session, tmp_path: Path) -> None:
