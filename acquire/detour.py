@@ -98,7 +98,12 @@ class _Search:
         return None
 
     def _drawn(self, n: int) -> FloatArray:
-        drawn = self._rng.uniform(self._low, self._high, (n, len(self._low)))
+        first, second = self._ends
+        # near the straight way first: half of the points would else be needlessly far
+        share = np.linspace(0.1, 1.0, n)[:, None]
+        beyond = share * self._settings.around_rad
+        low = np.maximum(self._low, np.minimum(first, second) - beyond)
+        drawn = self._rng.uniform(low, np.maximum(low, np.minimum(self._high, np.maximum(first, second) + beyond)))
         drawn = drawn[within_limits(self._model, drawn, _LIMIT_MARGIN_RAD)]
         return drawn[~self._check(drawn)]
 

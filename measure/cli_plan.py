@@ -134,6 +134,9 @@ def _tell(console: Console, result: PlanResult, out: Path) -> None:
     vias = sum(len(pose.via_rad) for pose in result.plan.poses) - result.n_one_sided
     around = f", {vias} points to pass round what stands in the way" if vias else ""
     console.say(f"{len(result.plan.poses)} poses in {out}, {result.n_one_sided} reached from the same side{around}")
+    if result.lengths is not None and result.lengths.wanted_mm is not None and result.lengths.longest_mm < result.lengths.wanted_mm:
+        longest, wanted = result.lengths.longest_mm, result.lengths.wanted_mm
+        console.note(f"its spheres are at most {longest:.0f} mm apart, less than two thirds of the work volume's diagonal ({wanted:.0f} mm)")
     if result.coverage is not None:
         _tell_coverage(console, result.coverage)
     length_mm, centre_mm = (result.plan.predicted.get(key) for key in ("length_rms_mm", "centre_rms_mm"))

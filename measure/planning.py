@@ -63,6 +63,21 @@ class PlanSettings:
     """What shots are like, e.g. of an earlier calibration; stated defaults if None. For calibrations."""
 
 
+@dataclass(frozen=True, slots=True)
+class Lengths:
+    """What lengths a verification will see."""
+
+    longest_mm: float
+    """Between two spheres of the plan, by their places in the cell file."""
+    diagonal_mm: float | None
+    """Of the work volume, None where the cell has none."""
+
+    @property
+    def wanted_mm(self) -> float | None:
+        """Two thirds of the diagonal: shorter lengths say little of the volume's ends."""
+        return None if self.diagonal_mm is None else 2 / 3 * self.diagonal_mm
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanResult:
     """A plan, and what became of the candidates."""
@@ -75,6 +90,8 @@ class PlanResult:
     """Poses that are reached by turning every axis forwards."""
     coverage: Coverage | None = None
     """Of the part, where there is one."""
+    lengths: Lengths | None = None
+    """Of a verification."""
 
     def to_json_dict(self) -> Mapping[str, object]:
         """What `spherecal plan --json` prints; predictions are null but for calibrations."""
@@ -85,6 +102,7 @@ class PlanResult:
             "poses": [{"id": p.id, "sphere": p.sphere, "joints_rad": p.joints_rad, "via_rad": p.via_rad} for p in self.plan.poses],
             "n_one_sided": self.n_one_sided,
             **({} if self.coverage is None else {"coverage": self.coverage.to_json_dict()}),
+            **({} if self.lengths is None else {"longest_length_mm": self.lengths.longest_mm, "wanted_length_mm": self.lengths.wanted_mm}),
             "predicted": {"centre_rms_mm": None, "length_rms_mm": None} | {k: v for k, v in self.plan.predicted.items() if k != "coverage"},
         }
 
@@ -113,7 +131,17 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
             pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng))))
     if settings.purpose == "calibration":
         return _result(cell, settings, model, check, *_designed(cell, model, pools, settings, rng))
-    return _result(cell, settings, model, check, pools)
+    result = _result(cell, settings, model, check, pools)
+    return replace(result, lengths=_lengths(cell, result.plan)) if settings.purpose == "verification" else result
+
+
+def _lengths(cell: Cell, plan: Plan) -> Lengths | None:
+    """The longest distance between spheres that a plan looks at, against the work volume's diagonal."""
+    names = sorted({pose.sphere for pose in plan.poses if pose.sphere is not None})
+    centres = np.array([cell.spheres[name].centre_in_base_mm for name in names], dtype=np.float64).reshape(-1, 3)
+    box = cell.work_volume_box_mm
+    longest_mm = float(np.linalg.norm(centres[:, None] - centres, axis=-1).max(initial=0.0))
+    return Lengths(longest_mm, None if box is None else float(np.linalg.norm(box[1] - box[0])))
 
 
 def _covering(cell: Cell, settings: PlanSettings, part: MeshObstacle, model: RobotModel, flange_from_camera: FloatArray) -> PlanResult:

@@ -103,7 +103,11 @@ def test_the_seed_makes_the_plan_and_purposes_differ(cell: Cell) -> None:
 
 def test_a_verification_is_spread_and_predicts_nothing(cell: Cell) -> None:
     result = make_plan(cell, PlanSettings("verification", n_poses=12))
-    assert result.to_json_dict()["predicted"] == {"centre_rms_mm": None, "length_rms_mm": None}
+    told = result.to_json_dict()
+    assert told["predicted"] == {"centre_rms_mm": None, "length_rms_mm": None}
+    # G to I, and two thirds of the diagonal of 500 x 600 x 500 mm
+    assert told["longest_length_mm"] == pytest.approx(603, abs=4)
+    assert told["wanted_length_mm"] == pytest.approx(618.2, abs=0.1)
 
 
 def test_a_calibration_plan_uses_several_branches_and_shares_its_poses(cell: Cell) -> None:
