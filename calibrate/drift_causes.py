@@ -29,6 +29,8 @@ HAND_EYE, CAMERA, SPHERE, SHOT = "hand-eye", "camera", "sphere moved", "single s
 
 FALSE_ALARM = 0.0125
 """Chance of an alarm where nothing changed, all tests together."""
+_ALIKE_SIGMAS, _GENEROUS = 1.5, 8.0
+"""A cause that can imitate another to within so much, by sizes of up to so many times the usual ones, is told beside it."""
 _SHARE = 0.05
 """Part of that for each test that names nothing: of all residuals, of axis 1, the last axis, spheres and single shots."""
 _SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0)
@@ -188,6 +190,8 @@ class Diagnosis:
     """Natural logarithm of the evidence for any of the causes against that for no change."""
     explanations: tuple[Explanation, ...]
     """The likeliest first."""
+    alike: tuple[str, ...] = ()
+    """Other causes that could do to these shots what the likeliest one does, but for less than they show."""
 
     @property
     def changed(self) -> bool:
@@ -216,8 +220,9 @@ def diagnose(residuals: CheckResiduals, causes: Sequence[Cause]) -> Diagnosis:
         for cause, evidence, (_, explained, k, amplitudes), alone in weighed
     ]
     explanations.sort(key=lambda e: -e.probability)
+    alike = _alike(explanations[0], causes, factor)
     prior = sum(cause.prior for cause in causes)
-    return Diagnosis(total, freedom, float(min(1.0, *p_values)), log_total - float(np.log(prior)), tuple(explanations))
+    return Diagnosis(total, freedom, float(min(1.0, *p_values)), log_total - float(np.log(prior)), tuple(explanations), alike)
 
 
 def named(diagnosis: Diagnosis, n_axes: int) -> tuple[str, ...]:
@@ -228,10 +233,29 @@ def named(diagnosis: Diagnosis, n_axes: int) -> tuple[str, ...]:
     if not diagnosis.changed:
         return ()
     first = diagnosis.explanations[0]
-    alike = {"axis 1": SPHERE, f"axis {n_axes}": HAND_EYE}
+    exactly = {"axis 1": SPHERE, f"axis {n_axes}": HAND_EYE}
     told = [first.name, *(e.name for e in diagnosis.explanations[1:] if e.probability > ODDS * first.probability)]
-    told += [other for axis, other in alike.items() if axis in told and other not in told]
+    told += [name for name in diagnosis.alike if name not in told]
+    told += [other for axis, other in exactly.items() if axis in told and other not in told]
     return tuple(told)
+
+
+def _alike(likeliest: Explanation, causes: Sequence[Cause], factor: FloatArray) -> tuple[str, ...]:
+    """Causes that leave less than the shots can show of the likeliest one's effect."""
+    own = next(cause for cause in causes if cause.name == likeliest.name)
+    shape = next(shape for shape in own.shapes if set(shape.names) == set(likeliest.amplitudes))
+    change = np.array([likeliest.amplitudes[name][0] for name in shape.names])
+    effect = np.linalg.solve(factor, shape.columns @ change)
+    found = []
+    for cause in causes:
+        if cause.name not in (own.name, SHOT):
+            columns = _GENEROUS * np.linalg.solve(factor, np.concatenate([s.scaled for s in cause.shapes], axis=1))
+            inner = columns.T @ columns + np.eye(columns.shape[1])
+            toward = columns.T @ effect
+            left = float(effect @ effect - toward @ np.linalg.solve(inner, toward))
+            if left < _ALIKE_SIGMAS**2:
+                found.append(cause.name)
+    return tuple(found)
 
 
 def _chance(chi_square: float, freedom: int, noise_freedom: float) -> float:
