@@ -150,12 +150,12 @@ def _repeat(rng: np.random.Generator, n_views: int, sigma_mm: float, told_mm: fl
     return figures_of(views, {"A": SphereSize(19.05)}, line_profile=False).spheres["A"]
 
 
-@pytest.mark.parametrize("n_views", [2, 3, 6])
+@pytest.mark.parametrize("n_views", [2, 4])
 def test_the_uncertainty_of_a_diameter_covers_its_scatter_with_few_views(n_views: int) -> None:
-    """Views shifted by 0.05 mm each: 60 repeats lie within what each claims (k = 2), whether or not the shifts were foretold."""
+    """Views shifted by 0.05 mm each: 40 repeats lie within what each claims (k = 2), whether or not the shifts were foretold."""
     rng = np.random.default_rng(17)
     for told in (0.05, None):
-        found = [_repeat(rng, n_views, 0.05, told) for _ in range(60)]
+        found = [_repeat(rng, n_views, 0.05, told) for _ in range(40)]
         error, claim = (np.array([getattr(f, name) for f in found]) for name in ("diameter_error_mm", "diameter_standard_uncertainty_mm"))
         assert np.mean(np.abs(error) <= 2 * claim) >= 0.9
         # and it is no boast in the other direction: seen and claimed are of one size
