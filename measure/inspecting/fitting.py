@@ -13,7 +13,7 @@ What is common to a whole feature shows in no residual: for that a fit keeps its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,12 +114,14 @@ def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
         message = f"{n_points} points of the cloud lie where the feature should be, {_FEWEST_PER_PARAMETER * n_params} are needed"
         raise DataError(message, where=name, remedy=_LOOK)
     thinned = slice(None, None, max(1, len(local) // _THINNED))
-    params, scale = _robust_start(shape, local[thinned], points.weights[thinned], points.voxel_mm, name)
-    kept = np.abs(shape.distances(params, local).residual_mm) <= max(_CUT * scale, _VOXELS * points.voxel_mm)
+    robust, scale = _robust_start(shape, local[thinned], points.weights[thinned], points.voxel_mm, name)
+    kept = np.abs(shape.distances(robust, local).residual_mm) <= max(_CUT * scale, _VOXELS * points.voxel_mm)
     local, used = local[kept], points.taken(kept)
-    params = _least_squares(shape, local, used.weights, params, name)
+    params = _least_squares(shape, local, used.weights, robust, name)
     _require_near_nominal(shape, params, name)
-    return _described(shape, params, local, used, len(kept) - len(local))
+    found = _described(shape, params, local, used, len(kept) - len(local))
+    # what hangs on how far-off points are treated is not known better than that
+    return replace(found, covariance=found.covariance + np.outer(params - robust, params - robust))
 
 
 def _robust_start(shape: Shape, local: FloatArray, weights: FloatArray, voxel_mm: float, name: str) -> tuple[FloatArray, float]:

@@ -57,9 +57,9 @@ CLOUD = scanned(TRUE_PART, 60_000, 1)
 CHECKS = [{"kind": "distance", "between": list(pair), "tolerance": 0.5} for pair in PAIRS]
 
 
-def inspected(points: FloatArray = CLOUD, **changes: object) -> Inspection:
+def inspected(points: FloatArray = CLOUD, *, with_map: bool = False, **changes: object) -> Inspection:
     settings: dict[str, object] = {"alignment": {"base_from_part": PLACE.tolist()}, "point_expanded_uncertainty_mm": 0.01}
-    return inspect_cloud(measured_cloud(points), NOMINAL, drawn_spec(**{**settings, **changes}))
+    return inspect_cloud(measured_cloud(points), NOMINAL, drawn_spec(**{**settings, **changes}), with_map=with_map)
 
 
 def values_of(result: Inspection) -> dict[str, float]:
@@ -139,7 +139,7 @@ def test_zones_use_the_whole_tolerance_and_profile_judges_the_surface() -> None:
 
 
 def test_a_known_optical_offset_is_taken_out_and_an_unknown_one_charged() -> None:
-    plain, moved, unsure = (inspected(surface=s) for s in ({}, {"offset_mm": 0.05}, {"expanded_uncertainty_mm": 0.2}))
+    plain, moved, unsure = (inspected(surface=s, with_map=True) for s in ({}, {"offset_mm": 0.05}, {"expanded_uncertainty_mm": 0.2}))
 
     def diameter(result: Inspection, name: str) -> tuple[float, float]:
         value = next(v for f in result.features if f.name == name for v in f.values if v.name == "diameter")
@@ -154,10 +154,10 @@ def test_a_known_optical_offset_is_taken_out_and_an_unknown_one_charged() -> Non
 
 
 def test_files_are_whole_and_replace_only_a_former_inspection(tmp_path: Path) -> None:
-    result = inspected(checks=CHECKS)
+    result = inspected(checks=CHECKS, with_map=True)
     folder = tmp_path / "out"
-    for _ in range(2):
-        write_outputs(folder, result)
+    write_outputs(folder, result, recording=False)
+    write_outputs(folder, result)
     assert sorted(path.name for path in folder.iterdir()) == [
         "checks.csv",
         "deviations.ply",
@@ -251,17 +251,17 @@ class DrawnSystem:
 
 
 def test_intervals_through_the_views_of_a_drawn_calibration_cover() -> None:
-    """The small twin of the qualification: 12 systems with errors of known size, each measures the part from 6 views."""
+    """The small twin of the qualification: 10 systems with errors of known size, each measures the part from 6 views."""
     sigma = np.array([0.05] * 3 + [1e-4] * 3 + [0.08] * 3 + [3e-4] * 3)
     eyes = [se3.from_rotation_translation(se3.exp_so3([np.pi + a, b, 0.5 * a]), [0, 0, 0]) for a in (-0.4, 0.0, 0.4) for b in (-0.3, 0.3)]
     middle = PLACE[:3, 3] + [0, 0, 40]
     poses = [se3.from_rotation_translation(eye[:3, :3], middle - eye[:3, :3] @ [0, 0, 400.0]) for eye in eyes]
-    reference = values_of(inspected(CLOUD[::2], checks=CHECKS))
-    inside: list[bool] = []
-    for seed in range(12):
+    reference = values_of(inspected(CLOUD[::3], checks=CHECKS))
+    normed: list[float] = []
+    for seed in range(10):
         rng = np.random.default_rng([20, seed])
         system = DrawnSystem(rng.normal(0, sigma), sigma)
-        shares = np.array_split(rng.permutation(CLOUD[::2]), len(poses))
+        shares = np.array_split(rng.permutation(CLOUD[::3]), len(poses))
         views, clouds = [], []
         for pose, share in zip(poses, shares, strict=True):
             twist = np.concatenate([rng.normal(0, 0.02, 3), rng.normal(0, 1e-4, 3)])
@@ -280,5 +280,8 @@ def test_intervals_through_the_views_of_a_drawn_calibration_cover() -> None:
         result = inspect_cloud(measured_cloud(np.concatenate(clouds)), NOMINAL, spec, field_source=source, with_map=False)
         widths = {f"{f.name} {v.name}": v.expanded_uncertainty for f in result.features for v in f.values}
         widths |= {check.name: check.expanded_uncertainty for check in result.checks}
-        inside += [abs(value - reference[name]) <= widths[name] for name, value in values_of(result).items() if not name.startswith("sink d")]
-    assert 0.90 <= np.mean(inside) <= 0.995
+        found = values_of(result)
+        normed += [2 * (found[name] - value) / widths[name] for name, value in reference.items() if not name.startswith("sink d")]
+    assert np.mean(np.abs(normed) <= 2) >= 0.90
+    # nor are they wide: of normed errors of standard deviation 1 the rms is this near to it
+    assert 0.5 <= np.sqrt(np.mean(np.square(normed))) <= 1.25
