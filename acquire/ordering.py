@@ -17,10 +17,11 @@ _MOST_SWEEPS = 30
 _LIMIT_MARGIN_RAD = float(np.radians(2))
 
 
-def choose_spread(pool: CandidatePool, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def choose_spread(pool: CandidatePool, n: int, rng: np.random.Generator, away_from_rad: FloatArray | None = None) -> NDArray[np.intp]:
     """Rows (n,) of a pool, each the farthest from those chosen before it: in the camera, in view direction and roll, and in axis angles.
 
     Branches of one arm differ in axis angles, so they are spread as well. No view is taken twice while there are others.
+    With `away_from_rad` (m, n), axis angles, the first half is as far from those too, whole turns aside: other branches of the arm.
 
     Raises:
         SettingsError: the pool holds fewer poses than wanted.
@@ -33,14 +34,18 @@ def choose_spread(pool: CandidatePool, n: int, rng: np.random.Generator) -> NDAr
     if n <= 0:
         return np.zeros(0, dtype=np.intp)
     features = _features(pool)
-    chosen = [int(rng.integers(len(features)))]
     nearest = np.full(len(features), np.inf)
-    for _ in range(n - 1):
+    chosen = [int(rng.integers(len(features)))]
+    away = np.full(len(features), np.inf)
+    if away_from_rad is not None and len(away_from_rad):
+        away = _away(pool.joints_rad, away_from_rad)
+        chosen = [int(np.argmax(away))]
+    for i in range(1, n):
         nearest = np.minimum(nearest, ((features - features[chosen[-1]]) ** 2).sum(axis=-1))
         nearest[chosen[-1]] = -np.inf
         again = pool.view == pool.view[chosen[-1]]
         nearest[again] = np.minimum(nearest[again], -1.0)
-        chosen.append(int(np.argmax(nearest)))
+        chosen.append(int(np.argmax(np.minimum(nearest, away) if 2 * i < n else nearest)))
     return np.array(chosen, dtype=np.intp)
 
 
@@ -117,6 +122,15 @@ def _features(pool: CandidatePool) -> FloatArray:
         ],
         axis=-1,
     )
+
+
+def _away(joints_rad: FloatArray, from_rad: FloatArray) -> FloatArray:
+    """Squared distances (k,) of axis angles to the nearest of others (m, n), on the scale of `_features`."""
+    apart = joints_rad[:, None] - from_rad
+    turns = np.abs(apart - 2 * np.pi * np.round(apart / (2 * np.pi)))
+    span = np.maximum(np.ptp(joints_rad, axis=0), 1e-9)
+    shares = _WEIGHT_JOINTS * np.minimum(turns / span, 1.0) / np.sqrt(joints_rad.shape[1])
+    return np.asarray((shares**2).sum(axis=-1).min(axis=1))
 
 
 def _scaled(values: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from acquire.cell import Cell
     from acquire.obstacles import MeshObstacle
     from calibrate.design_shots import Expectation
+    from drivers.kinematics.se3 import FloatArray
     from measure.console import Console
     from measure.covering import Coverage
     from measure.planning import PlanResult, Purpose
@@ -77,7 +78,8 @@ def plan(
             _part(loaded, part, placed, purpose),
             seed,
             None if start_deg is None else np.radians(_angles(start_deg)),
-            _expectation(calibration),
+            _expectation(calibration) if purpose is For.calibrate else None,
+            _poses_of(calibration) if purpose is For.verify else None,
         )
         result = make_plan(loaded, settings) if purpose is not For.check else _check_plan(cell, calibration, sphere or [], n, seed)
         with replacing(out, PLAN_FORMAT) as former:
@@ -126,6 +128,18 @@ def _expectation(calibration: Path | None) -> Expectation | None:
     from calibrate.design_cell import expectation_of
 
     return None if calibration is None else expectation_of(Calibration.load(calibration))
+
+
+def _poses_of(calibration: Path | None) -> FloatArray | None:
+    """(m, n) axis angles that a calibration was made at."""
+    import numpy as np
+
+    from calibrate import Calibration
+
+    if calibration is None:
+        return None
+    joints = [shot.joints_rad for shot in Calibration.load(calibration).shots if shot.joints_rad is not None]
+    return np.array(joints) if joints else None
 
 
 def _tell(console: Console, result: PlanResult, out: Path) -> None:

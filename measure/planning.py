@@ -61,6 +61,8 @@ class PlanSettings:
     """(n,) where the robot stands before the run; None if nobody knows."""
     expectation: Expectation | None = None
     """What shots are like, e.g. of an earlier calibration; stated defaults if None. For calibrations."""
+    away_from_rad: FloatArray | None = None
+    """(m, n) poses of a calibration, which its verification keeps away from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +130,7 @@ def make_plan(cell: Cell, settings: PlanSettings) -> PlanResult:
         spheres = _spheres(cell, settings.spheres)
         for name, n in zip(spheres, _shared_out(settings.n_poses, len(spheres)), strict=True):
             pool = _sphere_pool(cell, name, n, model, flange_from_camera, view, check, rng)
-            pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng))))
+            pools.append((name, pool if settings.purpose == "calibration" else pool.take(choose_spread(pool, n, rng, settings.away_from_rad))))
     if settings.purpose == "calibration":
         return _result(cell, settings, model, check, *_designed(cell, model, pools, settings, rng))
     result = _result(cell, settings, model, check, pools)

@@ -39,6 +39,16 @@ def test_chosen_poses_are_spread_wider_than_random_ones() -> None:
     assert (spread > 1.1 * candidates.centre_in_camera_mm.std(axis=0)).all()
 
 
+def test_half_of_the_poses_keep_away_from_others_whole_turns_aside() -> None:
+    candidates = pool(300)
+    others = candidates.joints_rad[candidates.joints_rad[:, 4] > 0] + 2 * np.pi
+    rows = choose_spread(candidates, 20, np.random.default_rng(0), others)
+    assert len(set(rows.tolist())) == 20
+    on_the_other_side = candidates.joints_rad[rows, 4] < 0
+    assert on_the_other_side[:10].all()
+    assert not on_the_other_side[10:].all()
+
+
 @pytest.mark.parametrize("n", [0, 1, 7, 30])
 def test_no_pose_is_chosen_twice_and_the_seed_decides(n: int) -> None:
     candidates = pool(30)
