@@ -160,11 +160,14 @@ def test_absolute_rates(rates: dict[str, float]) -> None:
 
 
 def test_memory_is_flat_in_the_number_of_scans(cell: OrganisedCell, session: Session, scans: list[NDArray[np.float32]]) -> None:
-    fuse(cell, session, scans, N_POSES, full=True)
-    before = peak_mb()
-    stitcher, _, _ = fuse(cell, session, scans, N_SCANS, full=True)
-    print(f"\nbench  peak memory after {N_POSES} scans {before:.0f} MB, after {N_SCANS} {peak_mb():.0f} MB, {stitcher.grid.n_voxels} voxels", end="")
-    assert peak_mb() - before < 60
+    peaks = []
+    for n_scans in (N_POSES, N_SCANS):
+        # forget the peak of what ran before
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        fuse(cell, session, scans, n_scans, full=True)
+        peaks.append(peak_mb())
+    print(f"\nbench  peak memory with {N_POSES} scans {peaks[0]:.0f} MB, with {N_SCANS} {peaks[1]:.0f} MB", end="")
+    assert peaks[1] < peaks[0] + 60
 
 
 def test_from_the_last_scan_to_the_cloud(cell: OrganisedCell, session: Session, tmp_path: Path) -> None:
@@ -172,6 +175,7 @@ def test_from_the_last_scan_to_the_cloud(cell: OrganisedCell, session: Session, 
     twelve = cell.session(12, SIDE)
     stitch(cell.calibration, twelve, tmp_path / "cloud.ply", VOXEL_MM)
     result = stitch(cell.calibration, twelve, tmp_path / "cloud.ply", VOXEL_MM)
+    assert result.n_scans == 12
     tell("stitch, 12 scans of 1 M points, disk to disk", result.seconds, f"{result.points_per_second / 1e6:.1f} Mpoints/s, {result.n_points} points")
     assert result.seconds < 1.2
 
