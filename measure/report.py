@@ -36,7 +36,7 @@ from measure.report_text import (
     tables_of,
 )
 from measure.sphere_figures import Figures
-from measure.verify_result import VerifyResult
+from measure.verify_result import TRAINING_REMARK, VerifyResult
 
 _CHECK_COLOUR = "#7a3e9d"
 
@@ -130,6 +130,7 @@ def page_of(facts: CalibrationFacts, verification: VerifyResult | None, moment: 
         created_utc=moment.strftime("%Y-%m-%d %H:%M UTC"),
         software=_software(),
         decision_rule=decision_text(verification),
+        on_every_page="" if verification is None or verification.held_out else TRAINING_REMARK,
     )
 
 

@@ -123,3 +123,5 @@ class Page:
     created_utc: str
     software: str
     decision_rule: str
+    on_every_page: str = ""
+    """What no page may be shown without."""

@@ -60,6 +60,10 @@ def pdf_bytes(page: Page) -> bytes:
         canvas.setFillColor(_SOFT)
         canvas.drawString(_MARGIN_PT, 30, f"{page.title}  ·  {page.created_utc}  ·  {page.software}")
         canvas.drawRightString(595.28 - _MARGIN_PT, 30, str(template.page))
+        if page.on_every_page:
+            canvas.setFont(_BOLD, 8)
+            canvas.setFillColor(_TONES["bad"])
+            canvas.drawString(_MARGIN_PT, 841.89 - 30, page.on_every_page)
         canvas.restoreState()
 
     document.build(_story(page), onFirstPage=foot, onLaterPages=foot)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
+import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +65,26 @@ def test_long_tables_go_on_over_pages() -> None:
 @pytest.mark.parametrize("text", ["<b>&</i> %s \\ <script>", "Ü–²°µ≥→ θ", "x" * 400, "\x00\x07", ""])
 def test_no_text_breaks_it(text: str) -> None:
     assert pdf_bytes(page(text=text)).startswith(b"%PDF-")
+
+
+def test_a_remark_for_every_page_is_on_every_page() -> None:
+    plain, marked = (pdf_bytes(replace(page(n_rows=200), on_every_page=remark)) for remark in ("", "training data"))
+    red = re.compile(rb"\.701961 \.14902 \.117647 rg")
+
+    def marks(data: bytes) -> int:
+        return sum(bool(red.search(stream)) for stream in streams(data))
+
+    assert marks(plain) == 0
+    assert marks(marked) == n_pages(marked) == n_pages(plain)
+
+
+def streams(data: bytes) -> list[bytes]:
+    """Contents of the pages, unpacked."""
+    found = []
+    for packed in re.findall(rb"/ASCII85Decode /FlateDecode[^>]*>>\s*stream\r?\n(.*?)endstream", data, re.S):
+        unpacked = zlib.decompress(base64.a85decode(packed.strip().removesuffix(b"~>")))
+        found += [unpacked] if b" Tf" in unpacked else []
+    return found
 
 
 def test_it_appears_whole_or_not_at_all(tmp_path: Path) -> None:
