@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import DataError, SettingsError
 from drivers.kinematics import se3
@@ -25,7 +26,8 @@ _NEAR = 0.01
 """Of the part's size: points of a fitted part lie nearer than this."""
 _SCALES = 4.0
 _SETTLED_MM = 1e-4
-_LEAST_OVERLAP, _PLAINLY_RIGHT = 0.25, 0.9
+_LEAST_OVERLAP, _LIKELY_RIGHT, _PLAINLY_RIGHT = 0.25, 0.8, 0.9
+_BOX_MARGIN, _FEWEST_BOXED = 0.03, 500
 _LEAST_HOLD = 1e-3
 """Mean square of the normals' share in the least held motion, turns taken at the part's radius."""
 
@@ -53,10 +55,14 @@ def best_fit(surface: NominalSurface, cloud: PartCloud) -> BestFit:
     Raises:
         DataError: no placement brings a quarter of the points near the mesh, or the points leave it free to slide.
     """
-    points = cloud.points_mm[:: max(1, len(cloud.points_mm) // _THINNED)]
-    starts = [np.eye(4), *_principal_starts(points, surface)]
-    found = None
-    for start in starts:
+    everything = cloud.points_mm
+    boxed = _near_box(everything, surface)
+    # a table and fixtures round the part are left out where the part is about where it should be
+    found = _iterate(surface, _thinned(everything[boxed]), np.eye(4)) if boxed.sum() >= _FEWEST_BOXED else None
+    if found is not None and found[2] >= _LIKELY_RIGHT:
+        return _finished(surface, everything[boxed], found[0])
+    points = _thinned(everything)
+    for start in (np.eye(4), *_principal_starts(points, surface)):
         tried = _iterate(surface, points, start)
         if found is None or tried[1] < found[1]:
             found = tried
@@ -68,7 +74,18 @@ def best_fit(surface: NominalSurface, cloud: PartCloud) -> BestFit:
             f"the cloud does not fit the nominal: {overlap:.0%} of its points come near it",
             remedy="Give alignment.base_from_part about right, crop what is not the part, or check that this is the part's nominal.",
         )
-    return _finished(surface, cloud, found[0])
+    return _finished(surface, everything, found[0])
+
+
+def _thinned(points: FloatArray) -> FloatArray:
+    return points[:: max(1, len(points) // _THINNED)]
+
+
+def _near_box(points: FloatArray, surface: NominalSurface) -> NDArray[np.bool_]:
+    """Points (n, 3) in the box round the mesh and a little more."""
+    low, high = surface.nominal.box_mm
+    margin = _BOX_MARGIN * float((high - low).max())
+    return np.asarray(((points > low - margin) & (points < high + margin)).all(axis=1))
 
 
 def _iterate(surface: NominalSurface, points: FloatArray, start: FloatArray) -> tuple[FloatArray, float, float]:
@@ -98,11 +115,11 @@ def _step(nearest: FloatArray, normal: FloatArray, residual: FloatArray, weight:
     return np.asarray(-np.linalg.lstsq(matrix, (jacobian * weight[:, None]).T @ residual, rcond=1e-10)[0])
 
 
-def _finished(surface: NominalSurface, cloud: PartCloud, transform: FloatArray) -> BestFit:
+def _finished(surface: NominalSurface, everything: FloatArray, transform: FloatArray) -> BestFit:
     """The last fit, by plain least squares of all points that belong to the part; and how well it is known."""
-    stride = max(1, len(cloud.points_mm) // (20 * _THINNED))
+    stride = max(1, len(everything) // (20 * _THINNED))
     for _ in range(3):
-        points = se3.apply(transform, cloud.points_mm[::stride])
+        points = se3.apply(transform, everything[::stride])
         near = surface.nearest(points)
         scale = max(1.4826 * float(np.median(np.abs(near.signed_mm[~near.at_border]))), 1e-4)
         kept = (np.abs(near.signed_mm) < _SCALES * scale) & ~near.at_border

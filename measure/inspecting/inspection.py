@@ -211,7 +211,7 @@ def _covariances(
     blocks = [block_diag(fit.covariance, np.array([[forms[name].noise_variance_mm2]])) for name, fit in fits.items()]
     blocks += [fitted.covariance] if fitted else []
     everything = joint_covariance(responses, blocks, field, spec.surface.expanded_uncertainty_mm / 2)
-    at_form = np.cumsum([len(fit.params) + 1 for fit in fits.values()]) - 1
+    at_form = np.cumsum([len(fit.params) + 1 for fit in fits.values()], dtype=np.int64) - 1
     rows = np.eye(len(everything.by_surface))
     sigmas = {name: float(np.sqrt(everything.of(rows[[at]])[0, 0])) for name, at in zip(forms, at_form, strict=True)}
     return everything.of_rows(np.delete(np.arange(len(rows)), at_form)), sigmas
