@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.result import DeviationMap
-from measure.plots import svg_of
+from measure.plots import Drawn, svg_of
 
 _MOST_POINTS = 400_000
 _PIXELS = 640
@@ -48,7 +48,7 @@ def colours_of(signed_mm: FloatArray, scale_mm: float) -> NDArray[np.uint8]:
     return np.asarray(colormaps[_COLOURS](np.clip(0.5 + 0.5 * signed_mm / scale_mm, 0, 1), bytes=True)[:, :3], dtype=np.uint8)
 
 
-def colour_map_svg(deviations: DeviationMap, scale_mm: float, marks: Mapping[str, FloatArray]) -> str:
+def colour_map_svg(deviations: DeviationMap, scale_mm: float, marks: Mapping[str, FloatArray]) -> Drawn:
     """Straight and oblique view of the part; `marks` are places (3,) of features by name, frame of the part."""
     looks = _looks(deviations)
     stride = max(1, len(deviations.signed_mm) // _MOST_POINTS)
@@ -75,7 +75,7 @@ def colour_map_svg(deviations: DeviationMap, scale_mm: float, marks: Mapping[str
     return svg_of(draw, salt="deviations", size=(9.6, height))
 
 
-def histogram_svg(deviations: DeviationMap, scale_mm: float) -> str:
+def histogram_svg(deviations: DeviationMap, scale_mm: float) -> Drawn:
     """How many points deviate by how much."""
 
     def draw(figure: Any) -> None:
