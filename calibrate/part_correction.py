@@ -23,6 +23,7 @@ from calibrate.observations import SphereShot
 from calibrate.problem import Layout
 from calibrate.quick_check import CheckResiduals, check_residuals, known_state
 from calibrate.result import Calibration
+from calibrate.result_file import calibration_data
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel
@@ -93,8 +94,15 @@ def correct_for_part(calibration: Calibration, shots: Sequence[SphereShot]) -> P
     current, total = _estimated(calibration, shots, prior)
     covariance, sigma = moved_covariance(calibration, first, columns, prior)
     changes = {label: (float(v), float(u)) for label, v, u, p in zip(labels, total, sigma, prior, strict=True) if p > _HELD}
-    found = replace(current, covariance=covariance) if accepted else calibration
+    found = _named(replace(current, covariance=covariance), calibration, changes) if accepted else calibration
     return PartCorrection(found, accepted, reason, changes, {name: one.rms_mm for name, one in tried.items()}, len(names), len(shots))
+
+
+def _named(corrected: Calibration, parent: Calibration, changes: dict[str, tuple[float, float]]) -> Calibration:
+    """With an id of its own, and what it comes from among its inputs."""
+    inputs = {**parent.inputs, "parent": parent.id, "part_correction": {name: list(pair) for name, pair in changes.items()}}
+    named = replace(corrected, inputs=inputs)
+    return replace(named, id=str(calibration_data(named)["id"]))
 
 
 def _estimated(calibration: Calibration, shots: Sequence[SphereShot], prior: FloatArray) -> tuple[Calibration, FloatArray]:

@@ -12,6 +12,7 @@ from measure.cli_measure import CalibrationFile
 from measure.cli_run import AsJson, Debug, Quiet, command
 
 if TYPE_CHECKING:
+    from calibrate.part_correction import PartCorrection
     from measure.console import Console
     from measure.stitch import StitchResult
     from measure.stitching.refine import Refinement
@@ -26,6 +27,9 @@ def stitch(
     max_incidence: Annotated[float, typer.Option("--max-incidence", metavar="DEG", help="Drop what is seen more grazing.")] = 75.0,
     min_count: Annotated[int, typer.Option("--min-count", help="Leave out voxels with fewer points.")] = 1,
     refine: Annotated[bool, typer.Option("--refine", help="Register the scans to each other too; a second cloud.")] = False,
+    spheres_in_view: Annotated[
+        bool, typer.Option("--spheres-in-view", help="Correct for this part by the fixture spheres that its session shows too.")
+    ] = False,
     means_only: Annotated[bool, typer.Option("--means-only", help="No normals, spread and uncertainty: less memory.")] = False,
     memory: Annotated[float, typer.Option("--memory", metavar="MB", help="Of the voxel table; beyond it on disk.")] = 700.0,
     threads: Annotated[int | None, typer.Option("--threads", help="Scans worked on at a time [default: all processors].")] = None,
@@ -49,15 +53,31 @@ def stitch(
         loaded, read = Calibration.load(calibration), read_session(session)
         if rrd is not None:
             _require_ply(out)
+        correction = None
+        if spheres_in_view:
+            from measure.part_view import correct_by_session
+
+            correction = correct_by_session(loaded, read)
+            tell_correction(run.console, correction)
         with run.console.progress("stitching") as advance:
-            result = stitch_session(loaded, read, out, settings=settings, on_progress=advance)
+            result = stitch_session(loaded if correction is None else correction.calibration, read, out, settings=settings, on_progress=advance)
         if rrd is not None:
             from measure.viewer_cloud import write_cloud_recording
 
             write_cloud_recording(rrd, result.cloud, title=f"{out.name}: calibration {loaded.id[:12]}")
         tell_stitched(run.console, result)
         doubts = marked(run.console, place_of(history, calibration), loaded, last_taken_utc([read]))
-        run.finish({**result.to_json_dict(), "marked": doubts, **({} if rrd is None else {"rrd": str(rrd)})})
+        more = {} if rrd is None else {"rrd": str(rrd)}
+        part = {} if correction is None else {"part_correction": correction.to_json_dict()}
+        run.finish({**result.to_json_dict(), "marked": doubts, **more, **part})
+
+
+def tell_correction(console: Console, correction: PartCorrection) -> None:
+    """What the spheres in view said, for a person."""
+    if correction.accepted:
+        console.say(f"corrected for this part by {correction.n_spheres} spheres in {correction.n_shots} shots: {correction.reason}")
+    else:
+        console.note(f"warning: not corrected by the spheres in view: {correction.reason}")
 
 
 def tell_stitched(console: Console, result: StitchResult) -> None:

@@ -43,6 +43,7 @@ def test_lengths_of_a_part_come_right_again(case: Case) -> None:
     before, after = (length_errors_mm(c, part) for c in (case.calibration, found.calibration))
     assert rms(after) < 0.06
     assert rms(after) < 0.4 * rms(before)
+    assert found.calibration.inputs["parent"] == case.calibration.id != found.calibration.id
     value, sigma = found.changes["expansion"]
     assert abs(value - 25 * STEEL_PER_K) < 3 * sigma
     assert sigma < 25 * STEEL_PER_K / 3
