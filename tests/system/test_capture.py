@@ -179,7 +179,8 @@ def near_home(small: SmallCell, folder: Path) -> tuple[Path, Path, list[str]]:
     truth["robot"]["home_rad"] = home.tolist()
     (folder / "truth.yaml").write_text(dump_yaml(truth))
     cell.write_text(cell.read_text().replace(str(small.folder / "truth.yaml"), "truth.yaml"))
-    poses = tuple(PlannedPose(f"h{i}", None, home + 0.01 * (i + 1)) for i in range(3))
+    # on the way that the plan comes by, which is clear
+    poses = tuple(PlannedPose(f"h{i}", None, home - 0.006 * (i + 1)) for i in range(3))
     write_plan(Plan(load_cell(cell).sha256, "workpiece", poses), plan)
     return cell, plan, [pose.id for pose in poses]
 
