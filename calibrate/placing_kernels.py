@@ -36,7 +36,7 @@ def place_points(
             z = np.float64(points_in_camera_mm[start + i, 2])
             # isfinite says yes to infinity where sums may be regrouped
             valid = (abs(x) <= _LARGEST) & (abs(y) <= _LARGEST) & (abs(z) <= _LARGEST)
-            n_valid += valid
+            n_valid += 1 if valid else 0
             hole[i] = 0.0 if valid else np.nan
             # holes are corrected as the middle of the model, so that they cost no detour
             block[0, i] = x if valid else table.centre_mm[0]

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,18 @@ class FusedCloud:
         return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}, voxel_mm=voxel_mm)
 
 
+class _Columns(NamedTuple):
+    """The points of one scan as the kernels take them; see `fuse_kernels.insert`."""
+
+    keys: IntArray
+    fractions: NDArray[np.int16]
+    parts: NDArray[np.uint8]
+    present: NDArray[np.uint32]
+    weights: NDArray[np.uint8]
+    normals: NDArray[np.int16]
+    variances: NDArray[np.uint32]
+
+
 @dataclass(slots=True, eq=False)
 class _Part:
     """The voxels of some blocks: an index of 32-bit entries, and rows in the order in which they were first seen."""
@@ -89,7 +101,7 @@ class _Part:
     @property
     def n_bytes(self) -> int:
         """Memory of what is used: untouched pages cost nothing."""
-        return self.n_rows * self.rows.shape[1] * 8 + self.index.nbytes
+        return int(self.n_rows * self.rows.shape[1] * 8 + self.index.nbytes)
 
     def make_room(self, n_rows: int) -> None:
         """Grow until so many rows fit; the rows by half, so that the copy needs little more than they do."""
@@ -189,7 +201,7 @@ class VoxelGrid:
         keys, fractions, parts = np.empty(n, dtype=np.int64), np.empty((n, 3), dtype=np.int16), np.empty(n, dtype=np.uint8)
         present, fates = np.zeros(-(-n // kernels.BAND), dtype=np.uint32), np.zeros(kernels.FATES, dtype=np.int64)
         kernels.quantise(points, weight, self.voxel_mm, keys, fractions, parts, present, fates)
-        columns = (keys, fractions, parts, present, weight, normal, variance)
+        columns = _Columns(keys, fractions, parts, present, weight, normal, variance)
         self._insert(next(self._scans), int(np.bitwise_or.reduce(present, initial=0)), columns, fates)
         if fates[kernels.CROWDED]:
             raise DataError(
@@ -200,7 +212,7 @@ class VoxelGrid:
             self._empty_to_disk()
         return AddedPoints(int(fates[kernels.ADDED]), int(fates[kernels.INVALID]), int(fates[kernels.OUTSIDE]))
 
-    def _insert(self, scan: int, present: int, columns: tuple[NDArray[np.generic], ...], fates: IntArray) -> None:
+    def _insert(self, scan: int, present: int, columns: _Columns, fates: IntArray) -> None:
         """One scan into the parts that its points belong to; each part is locked for the whole scan, so that scans are counted once."""
         from measure import fuse_kernels as kernels
 
@@ -213,10 +225,10 @@ class VoxelGrid:
             waiting.remove(number)
             part = self._parts[number]
             try:
-                row, n_points = 0, len(columns[0])
+                row, n_points = 0, len(columns.keys)
                 while row < n_points:
                     halves = part.rows.view(np.int32)
-                    row, part.n_rows = kernels.insert(part.index, part.rows, halves, part.n_rows, number, row, *columns, scan, fates)  # type: ignore[arg-type]
+                    row, part.n_rows = kernels.insert(part.index, part.rows, halves, part.n_rows, number, row, *columns, scan, fates)
                     if row < n_points:
                         part.make_room(part.n_rows + 1)
             finally:

@@ -93,9 +93,9 @@ def quantise(
         ix, iy, iz = np.int64(floor_x) + HALF_RANGE, np.int64(floor_y) + HALF_RANGE, np.int64(floor_z) + HALF_RANGE
         keys[i] = (ix << (2 * INDEX_BITS)) | (iy << INDEX_BITS) | iz
         # the last step of a voxel may round up to the first of the next
-        fractions[i, 0] = np.int16(min(np.int64((x - floor_x) * FRACTION), FRACTION - 1) - FRACTION // 2)
-        fractions[i, 1] = np.int16(min(np.int64((y - floor_y) * FRACTION), FRACTION - 1) - FRACTION // 2)
-        fractions[i, 2] = np.int16(min(np.int64((z - floor_z) * FRACTION), FRACTION - 1) - FRACTION // 2)
+        fractions[i, 0] = np.int16(min(int((x - floor_x) * FRACTION), FRACTION - 1) - FRACTION // 2)
+        fractions[i, 1] = np.int16(min(int((y - floor_y) * FRACTION), FRACTION - 1) - FRACTION // 2)
+        fractions[i, 2] = np.int16(min(int((z - floor_z) * FRACTION), FRACTION - 1) - FRACTION // 2)
         block = ((ix >> _BLOCK_BITS) << (2 * INDEX_BITS)) | ((iy >> _BLOCK_BITS) << INDEX_BITS) | (iz >> _BLOCK_BITS)
         part = np.int64(_mixed(block) >> np.uint64(60))
         parts[i] = part
@@ -121,7 +121,7 @@ def _slot_of(index: NDArray[np.uint32], rows: IntArray, key: np.int64) -> np.int
 
 
 @compiled
-def _new_row(index: NDArray[np.uint32], slot: np.int64, rows: IntArray, n_rows: np.int64, key: np.int64) -> None:
+def _new_row(index: NDArray[np.uint32], slot: np.int64, rows: IntArray, n_rows: int, key: np.int64) -> None:
     index[slot] = np.uint32(n_rows + 1) | (np.uint32(_mixed(key) >> np.uint64(56)) << np.uint32(_ROW_BITS))
     for word in range(rows.shape[1]):
         rows[n_rows, word] = 0
@@ -129,7 +129,7 @@ def _new_row(index: NDArray[np.uint32], slot: np.int64, rows: IntArray, n_rows: 
 
 
 @compiled
-def _add_place(rows: IntArray, row: np.int64, w: np.int64, fractions: NDArray[np.int16], i: np.int64) -> None:
+def _add_place(rows: IntArray, row: np.int64, w: np.int64, fractions: NDArray[np.int16], i: int) -> None:
     x, y, z = np.int64(fractions[i, 0]), np.int64(fractions[i, 1]), np.int64(fractions[i, 2])
     rows[row, SUM] += w * x
     rows[row, SUM + 1] += w * y
@@ -170,7 +170,7 @@ def insert(
     full, with_normals, with_variances = rows.shape[1] == FULL_WORDS, normals.shape[0] > 0, variances.shape[0] > 0
     n = keys.shape[0]
     last_key, row = np.int64(0), np.int64(0)
-    i = np.int64(start)
+    i = start
     while i < n:
         end = min(n, (i // BAND + 1) * BAND)
         if not (present[i // BAND] >> np.uint32(part)) & np.uint32(1):
