@@ -23,6 +23,7 @@ from measure.report_facts import facts_of, folders_of
 from measure.report_insight import budget_pictures, budget_tables, field_pictures, field_tables, identifiability_tables
 from measure.report_page import CalibrationFacts, Page, Picture, ShotResidual, Table
 from measure.report_pdf import write_pdf
+from measure.report_residual import centre_shifts_mm, residual_pictures
 from measure.report_tables import beside_table, report_data, shots_table
 from measure.report_text import (
     calibration_rows,
@@ -35,7 +36,6 @@ from measure.report_text import (
     result_rows,
     tables_of,
 )
-from measure.sphere_figures import Figures
 from measure.verify_result import TRAINING_REMARK, VerifyResult
 
 _CHECK_COLOUR = "#7a3e9d"
@@ -144,6 +144,7 @@ def _pictures(facts: CalibrationFacts, verification: VerifyResult | None) -> lis
     if verification is not None:
         found += _centre_pictures(verification)
         found += _length_picture(verification)
+        found += residual_pictures(verification.figures, verification.maps)
     found += _shot_picture(facts, verification)
     found += _coverage_pictures(facts, verification)
     found += field_pictures(facts.camera_field, facts.seen_cells, facts.working_range_mm, facts.field_of_view_deg)
@@ -152,23 +153,13 @@ def _pictures(facts: CalibrationFacts, verification: VerifyResult | None) -> lis
 
 
 def _centre_pictures(verification: VerifyResult) -> list[Picture]:
-    after = _deviations_mm(verification.figures)
-    before = None if verification.before is None else _deviations_mm(verification.before)
+    after = centre_shifts_mm(verification.figures)[1]
+    before = None if verification.before is None else centre_shifts_mm(verification.before)[1]
     if not len(after):
         return []
     caption = "Centre of each shot about the mean of its sphere; the circle is the rms distance in space. Mind the two scales: blue is in both."
     views = (("from above", (0, 1)), ("from the side", (0, 2)))
     return [Picture(f"Sphere centres, {name}", caption, plots.centres_svg(before, after, axes=axes)) for name, axes in views]
-
-
-def _deviations_mm(figures: Figures) -> FloatArray:
-    """(n, 3) centre of each view minus the mean of its sphere, for spheres seen twice or more."""
-    rows: list[FloatArray] = []
-    for name in figures.spheres:
-        centres = [v.centre_in_base_mm for v in figures.views if v.sphere == name and v.centre_in_base_mm is not None]
-        if len(centres) > 1:
-            rows.append(np.stack(centres) - np.mean(centres, axis=0))
-    return np.concatenate(rows) if rows else np.empty((0, 3))
 
 
 def _length_picture(verification: VerifyResult) -> list[Picture]:

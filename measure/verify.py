@@ -35,6 +35,7 @@ from measure.proof.lengths import length_results
 from measure.proof.poses import repeated_poses, training_shots
 from measure.proof.probing import ProbingResult, probing_of
 from measure.proof.reach import shots_outside, warnings_of
+from measure.proof.residual_maps import residual_maps
 from measure.proof.volume import volume_figures
 from measure.sphere_figures import Figures, SphereSize, SphereView, figures_of, separation
 from measure.verify_result import SessionName, VerifyResult
@@ -143,6 +144,7 @@ def verify_observations(
         volume=volume,
         outside=outside,
         warnings=(*warnings_of(outside, len(observations.shots)), *(() if volume is None else volume.warnings())),
+        maps=residual_maps(observations.shots, views, figures, sizes),
     )
 
 

@@ -10,6 +10,7 @@ from measure.decision import GUARD_FACTOR, RULE, Judgement, Verdict
 from measure.proof.lengths import LengthResult
 from measure.proof.probing import Probing, ProbingResult
 from measure.proof.reach import OutsideShot
+from measure.proof.residual_maps import ResidualMaps
 from measure.proof.volume import VolumeFigures
 from measure.sphere_figures import Figures, SphereFigures
 
@@ -55,6 +56,8 @@ class VerifyResult:
     """Shots beyond the camera volume or axis ranges that the calibration saw."""
     warnings: tuple[str, ...] = ()
     """What a reader must know of these figures besides the verdict's reasons."""
+    maps: ResidualMaps | None = field(default=None, repr=False)
+    """What the report draws of the points."""
 
     @property
     def slides(self) -> tuple[LengthResult, ...]:

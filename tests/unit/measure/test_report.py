@@ -85,7 +85,7 @@ def test_the_page_needs_nothing_but_itself(calibration: Calibration, verificatio
     assert not {"script", "link", "img", "iframe", "object"} & tags
     links = re.findall(r'(?:href|src)="([^"]*)"', html) + re.findall(r"url\(([^)]*)\)", html)
     assert all(link.startswith(("#", "data:")) for link in links)
-    assert html.count("<svg") == 8
+    assert html.count("<svg") == 11
 
 
 def test_the_same_goes_to_machines_and_other_calibrations_stand_beside(
