@@ -27,6 +27,10 @@ def inspect(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The folder of results.")] = Path("inspection"),
     calibration: Annotated[Path | None, typer.Option("--calibration", help="What the cloud was stitched with: for uncertainties.")] = None,
     session: Annotated[Path | None, typer.Option("--session", help="What was stitched: goes with --calibration.")] = None,
+    correlation: Annotated[
+        Path | None, typer.Option("--correlation", help="Offsets of `gauge correlation`: corrected values beside the raw.")
+    ] = None,
+    judge_corrected: Annotated[bool, typer.Option("--judge-corrected", help="Judge what the correlation names by the corrected value.")] = False,
     no_recording: Annotated[bool, typer.Option("--no-recording", help="Leave the Rerun recording out.")] = False,
     history: HistoryPlace = None,
     as_json: AsJson = False,
@@ -35,6 +39,8 @@ def inspect(
 ) -> None:
     """Compare a cloud with its nominal: deviations, features, tolerances. Exit code 3 when the verdict is reject."""
     with command(as_json, debug, quiet) as run:
+        from drivers.errors import SettingsError
+        from measure.gauge.correlation import load_correlation
         from measure.inspecting.cloud import load_cloud
         from measure.inspecting.inspection import inspect_cloud
         from measure.inspecting.nominal import load_nominal
@@ -42,9 +48,13 @@ def inspect(
         from measure.inspecting.spec import InspectionSpec, load_spec
 
         require_replaceable(out)
+        if judge_corrected and correlation is None:
+            raise SettingsError("--judge-corrected without --correlation", remedy="Name the correlation file.")
+        offsets = None if correlation is None else load_correlation(correlation)
         wanted = InspectionSpec(format="spherecal-inspection/1") if spec is None else load_spec(spec)
         drawn, measured = load_nominal(nominal), load_cloud(cloud)
-        result = inspect_cloud(measured, drawn, wanted, field_source=_field_source(calibration, session, measured.calibration_id))
+        source = _field_source(calibration, session, measured.calibration_id)
+        result = inspect_cloud(measured, drawn, wanted, field_source=source, correlation=offsets, judge_corrected=judge_corrected)
         tell_inspection(run.console, result)
         write_outputs(out, result, recording=not no_recording)
         run.console.say(f"{out / 'inspection.html'} written")
@@ -75,6 +85,9 @@ def tell_inspection(console: Console, result: Inspection) -> None:
     rows = [[c.name, c.measured, c.expanded_uncertainty, f"{c.lower:.3f} {c.upper:.3f}", c.verdict.replace("_", " ")] for c in result.checks]
     if rows:
         console.table("tolerances, mm and degrees", ["what", "measured", "U (k=2)", "least, most", "verdict"], rows)
+    corrected = [[c.name, c.measured, c.corrected.value_mm, c.corrected.expanded_uncertainty_mm] for c in result.checks if c.corrected is not None]
+    if corrected:
+        console.table("by the correlation, mm", ["what", "measured", "corrected", "U (k=2)"], corrected)
     for feature in result.features:
         if feature.problem is not None:
             console.say(f"{feature.name}: {feature.problem}")

@@ -13,6 +13,7 @@ import numpy as np
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
+from measure.inspecting.coverage import along_outline
 from measure.inspecting.fitting import IntArray
 from measure.inspecting.shapes import StadiumShape
 
@@ -39,7 +40,7 @@ def rim_points(shape: StadiumShape, points_in_part_mm: FloatArray, rows: IntArra
     if len(local) < _FEWEST_POINTS:
         message = f"{len(local)} points of the surface lie round the edge, {_FEWEST_POINTS} are needed"
         raise DataError(message, where=name, remedy="Look at the scans there; a wall that is seen is measured with `use: wall`.")
-    off, arc = _along_outline(shape, local)
+    off, arc = _outside(shape, local), along_outline(shape, local)
     into = off * -shape.outward  # a hole's material lies outside of its outline
     spacing = spacing_mm(shape, local)
     order = np.lexsort((into, np.floor(arc / (_ARC_SPACINGS * spacing))))
@@ -54,8 +55,7 @@ def rim_points(shape: StadiumShape, points_in_part_mm: FloatArray, rows: IntArra
 
 def spacing_mm(shape: StadiumShape, local: FloatArray) -> float:
     """Of the surface's points in the ring of material round the outline, as if they stood in squares."""
-    off, _ = _along_outline(shape, local)
-    into = off * -shape.outward
+    into = _outside(shape, local) * -shape.outward
     depth = max(float(np.quantile(into, 0.99)), 0.2)
     inside = (into > 0.25 * depth) & (into <= depth)
     middle = shape.half_width_mm - shape.outward * 0.625 * depth
@@ -73,9 +73,6 @@ def _on_surface(local: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.bo
     return np.asarray(np.abs(height - middle) <= _PLANE_SCALES * scale)
 
 
-def _along_outline(shape: StadiumShape, local: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance outside of the nominal outline, and the way along it, both (n,)."""
-    off = shape.distances(np.zeros(len(shape.names)), local).residual_mm
-    u = np.clip(local[:, 0], -shape.half_straight_mm, shape.half_straight_mm)
-    angle = np.arctan2(local[:, 1], local[:, 0] - u)
-    return off, angle * shape.half_width_mm + np.where(angle > 0, -u, u) + 10 * shape.half_straight_mm
+def _outside(shape: StadiumShape, local: FloatArray) -> FloatArray:
+    """(n,) distance outside of the nominal outline."""
+    return shape.distances(np.zeros(len(shape.names)), local).residual_mm

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
+from measure.inspecting.coverage import Coverage, coverage_of, on_seen_sectors
 from measure.inspecting.shapes import Distances, Shape
 
 IntArray = NDArray[np.int64]
@@ -39,6 +40,8 @@ _FEWEST_PER_PARAMETER = 5
 _LARGEST_TURN_RAD = 0.15
 _LOOK = "Look at alignment, nominal and search_mm, and whether the scans show the place."
 _MOST_CONDITION = 1e5
+_LEAST_LEFT = 0.02
+"""Of a parameter's hold, where a patch is all that holds it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +81,8 @@ class Fit:
     """(K, p) mean of the residual's derivatives by the parameters."""
     patch_normal: FloatArray
     """(K, 3) mean of its derivatives by the point, frame of the part."""
+    coverage: Coverage | None = None
+    """Of a round feature's circumference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +121,7 @@ def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
     thinned = slice(None, None, max(1, len(local) // _THINNED))
     robust, scale = _robust_start(shape, local[thinned], points.weights[thinned], points.voxel_mm, name)
     kept = np.abs(shape.distances(robust, local).residual_mm) <= max(_CUT * scale, _VOXELS * points.voxel_mm)
+    kept[kept] = on_seen_sectors(shape, local[kept], robust)
     local, used = local[kept], points.taken(kept)
     params = _least_squares(shape, local, used.weights, robust, name)
     _require_near_nominal(shape, params, name)
@@ -190,7 +196,7 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     return Fit(
         shape=shape,
         params=params,
-        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm),
+        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm, found.jacobian),
         response=response,
         rms_mm=float(np.sqrt(np.average(found.residual_mm**2, weights=points.weights))),
         rows=points.rows,
@@ -199,6 +205,7 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
         patch_count=patches.counts,
         patch_jacobian=patches.mean(found.jacobian),
         patch_normal=patches.mean(gradient),
+        coverage=coverage_of(shape, local, params),
     )
 
 
@@ -233,26 +240,44 @@ def patches_of(points_mm: FloatArray, cells_across: int = _CELLS_ACROSS) -> tupl
     return (np.cumsum(taken) - 1)[keys], size
 
 
-def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray) -> FloatArray:
+def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray, jacobian: FloatArray | None = None) -> FloatArray:
     """(p, p) of parameters that answer to residuals (n,) at points (n, 3) by gains (n, p).
 
     Patches of two sizes, since nobody knows how far neighbours have errors in common: each variance is the larger one.
+    With the residuals' derivatives (n, p) it is what the fit changes by where one patch is left out (the jackknife by
+    groups, CR3 of R. M. Bell and D. F. McCaffrey, Survey Methodology 28, 2002): a patch that alone holds a parameter
+    has small residuals because of that, and would else pass for a good one.
     """
     scores = gain * residual_mm[:, None]
-    fine, coarse = (_by_patches(scores, patches_of(points_mm, cells)[0]) for cells in (_CELLS_ACROSS, _COARSE_CELLS_ACROSS))
+    pull = None if jacobian is None else gain[:, :, None] * jacobian[:, None, :]
+    fine, coarse = (_by_patches(scores, pull, patches_of(points_mm, cells)[0]) for cells in (_CELLS_ACROSS, _COARSE_CELLS_ACROSS))
     if fine is None:  # too few patches to tell anything
         fine = scores.T @ scores * max(1.0, len(scores) / _CELLS_ACROSS)
     larger = np.ones(len(fine)) if coarse is None else np.sqrt(np.maximum(np.diag(coarse) / np.maximum(np.diag(fine), 1e-300), 1.0))
     return np.asarray(fine * np.outer(larger, larger))
 
 
-def _by_patches(scores: FloatArray, labels: IntArray) -> FloatArray | None:
+def _by_patches(scores: FloatArray, pull: FloatArray | None, labels: IntArray) -> FloatArray | None:
     """The patches' sums of squares with Student's factor; None where there are too few patches."""
     from scipy.special import stdtrit
 
-    sums = PatchSums(labels, np.ones(len(labels))).total(scores)
+    patches = PatchSums(labels, np.ones(len(labels)))
+    sums = patches.total(scores)
     freedom = len(sums) - scores.shape[1]
     if freedom < _LEAST_FREEDOM:
         return None
     student = float(stdtrit(freedom, 0.975)) / 1.959964
-    return np.asarray(sums.T @ sums * (len(sums) / freedom) * student**2)
+    if pull is None:
+        return np.asarray(sums.T @ sums * (len(sums) / freedom) * student**2)
+    p = scores.shape[1]
+    # -gain jacobian summed over all points is the identity; what is left of it without a patch
+    left = np.eye(p) + patches.total(pull.reshape(len(scores), -1)).reshape(-1, p, p)
+    sums = _without_each(left, sums)
+    return np.asarray(sums.T @ sums * ((len(sums) - 1) / len(sums)) * student**2)
+
+
+def _without_each(left: FloatArray, sums: FloatArray) -> FloatArray:
+    """(K, p) changes of the fit by leaving out each patch, which alone moves it by sums (K, p)."""
+    open_ = np.linalg.cond(left) > _MOST_CONDITION
+    left = np.where(open_[:, None, None], left + _LEAST_LEFT * np.eye(left.shape[1]), left)
+    return np.asarray(np.linalg.solve(left, sums[:, :, None])[:, :, 0])

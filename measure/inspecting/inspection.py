@@ -11,7 +11,7 @@ import numpy as np
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
-from measure.decision import Verdict, judge
+from measure.gauge.correlation import Correlation
 from measure.inspecting.alignment import BestFit, best_fit, datum_alignment
 from measure.inspecting.cloud import MeasuredCloud
 from measure.inspecting.distance import NominalSurface
@@ -19,10 +19,11 @@ from measure.inspecting.features import PartCloud, fit_feature, shape_of
 from measure.inspecting.fitting import Fit, Response
 from measure.inspecting.form import Form, form_of, with_form
 from measure.inspecting.geometry import element_of, nominal_element
+from measure.inspecting.judging import Judging, check_result, feature_result, verdict_of
 from measure.inspecting.nominal import Nominal
-from measure.inspecting.quantities import Measured, Model, own_quantities, quantity_of_check, require_checks_fit
-from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, FeatureResult, Inspection, Value
-from measure.inspecting.spec import InspectionSpec, PairCheck, ProfileCheck, SizeCheck, ZoneCheck
+from measure.inspecting.quantities import Model, require_checks_fit
+from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, Inspection
+from measure.inspecting.spec import InspectionSpec, ProfileCheck
 from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance
 
 FieldSource = Callable[[Sequence[Response], FloatArray], FieldError]
@@ -42,22 +43,15 @@ class _Aligned:
     fitted: BestFit | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judging:
-    """What checks are judged with."""
-
-    model: Model
-    covariance: JointCovariance
-    forms: Mapping[str, tuple[float, float]]
-    """Form and its standard uncertainty, mm."""
-    problems: Mapping[str, str]
-    """Features that could not be measured, and why."""
-    deviations: DeviationMap | None
-    point_sigma_mm: float
-
-
 def inspect_cloud(
-    cloud: MeasuredCloud, nominal: Nominal, spec: InspectionSpec, *, field_source: FieldSource | None = None, with_map: bool = True
+    cloud: MeasuredCloud,
+    nominal: Nominal,
+    spec: InspectionSpec,
+    *,
+    field_source: FieldSource | None = None,
+    with_map: bool = True,
+    correlation: Correlation | None = None,
+    judge_corrected: bool = False,
 ) -> Inspection:
     """Align, fit, judge; then map the deviations.
 
@@ -67,6 +61,8 @@ def inspect_cloud(
         spec: features, alignment, tolerances.
         field_source: what is known of the cloud's common errors; from the cloud or the spec where None.
         with_map: whether deviations are wanted though no check asks for them.
+        correlation: offsets to a reference gauge, by the names of checks; shown beside the raw values.
+        judge_corrected: whether checks that it names are judged by the corrected value.
 
     Raises:
         DataError: nothing of the cloud lies on the part, or it cannot be aligned.
@@ -87,10 +83,10 @@ def inspect_cloud(
     covariance, sigmas = _covariances(responses, fits, forms, aligned.fitted, field, spec)
     deviations = _deviations(cloud, surface, aligned, model, spec) if surface is not None and profile else None
     judged = {name: (form.form_mm, sigmas[name]) for name, form in forms.items()}
-    judging = _Judging(model, covariance, judged, problems, deviations, field.point_sigma_mm())
-    features = tuple(_feature_result(name, judging) for name in spec.features)
-    checks = tuple(_check_result(number, spec, judging) for number in range(len(spec.checks)))
-    verdict, reasons = _verdict(checks, spec, field, problems)
+    judging = Judging(model, covariance, judged, problems, deviations, field.point_sigma_mm(), correlation, judge_corrected)
+    features = tuple(feature_result(name, judging) for name in spec.features)
+    checks = tuple(check_result(number, spec, judging) for number in range(len(spec.checks)))
+    verdict, reasons = verdict_of(checks, spec, field, judging)
     seconds = time.perf_counter() - began
     if deviations is None and with_map:
         deviations = _deviations(cloud, surface or NominalSurface.of(nominal), aligned, model, spec)
@@ -104,8 +100,14 @@ def inspect_cloud(
         n_points=len(cloud.points_mm),
         calibration_id=cloud.calibration_id,
         field_words=field.words,
-        inputs={"cloud": cloud.file, "nominal": nominal.file, "nominal_sha256": nominal.sha256, "session": cloud.session_digest},
-        notes=(*cloud.notes, *nominal.notes),
+        inputs={
+            "cloud": cloud.file,
+            "nominal": nominal.file,
+            "nominal_sha256": nominal.sha256,
+            "session": cloud.session_digest,
+            **_named(correlation),
+        },
+        notes=(*cloud.notes, *nominal.notes, *_on_correlation(correlation, checks)),
         seconds_to_verdict=seconds,
         deviations=deviations,
         feature_points_in_part_mm={name: aligned.cloud.points_mm[fit.rows] for name, fit in fits.items()},
@@ -217,91 +219,6 @@ def _covariances(
     return everything.of_rows(np.delete(np.arange(len(rows)), at_form)), sigmas
 
 
-def _feature_result(name: str, judging: _Judging) -> FeatureResult:
-    feature = judging.model.features[name]
-    if name in judging.problems:
-        return FeatureResult(name, feature.kind, judging.problems[name])
-    fit = judging.model.fits[name]
-    drawn = judging.model.nominal([name])
-    values = []
-    for quantity in own_quantities(name, drawn[name]):
-        found = judging.model.measure(quantity, judging.covariance)
-        values.append(Value(quantity.name, quantity.unit, quantity.value(drawn), found.value, 2 * found.standard_uncertainty))
-    form_mm, sigma_mm = judging.forms[name]
-    return FeatureResult(name, feature.kind, None, len(fit.rows), fit.n_rejected, fit.rms_mm, form_mm, 2 * sigma_mm, tuple(values))
-
-
-def _check_result(number: int, spec: InspectionSpec, judging: _Judging) -> CheckResult:
-    check = spec.checks[number]
-    features = _features_of(check)
-    shapes = {name: shape_of(spec.features[name]) for name in features}
-    drawn = {name: nominal_element(spec.features[name], shape) for name, shape in shapes.items()}
-    name = check.name or " ".join([check.kind.replace("_", " "), *(f"{a}" for a in ([" - ".join(features)] if features else []))])
-    unit, nominal = "mm", 0.0
-    quantity = None
-    if isinstance(check, SizeCheck | PairCheck) or (isinstance(check, ZoneCheck) and check.kind == "position"):
-        quantity = quantity_of_check(check, drawn)
-        unit = quantity.unit
-    if quantity is not None and isinstance(check, SizeCheck | PairCheck):
-        nominal = quantity.value(drawn) if check.nominal is None else check.nominal
-    lower, upper = _limits(check, nominal)
-    result = CheckResult(name, check.kind, features, unit, nominal, lower, upper, None, float("nan"), "not_proven")
-    missing = [feature for feature in features if feature in judging.problems]
-    if missing:
-        return replace(result, problem=f"{missing[0]}: {judging.problems[missing[0]]}")
-    if quantity is not None:
-        found = judging.model.measure(quantity, judging.covariance)
-    elif isinstance(check, ProfileCheck):
-        found = _profile(check, judging)
-    else:
-        found = Measured(*judging.forms[features[0]])
-    return _judged(result, found)
-
-
-def _features_of(check: SizeCheck | ZoneCheck | PairCheck | ProfileCheck) -> tuple[str, ...]:
-    if isinstance(check, PairCheck):
-        return check.between
-    return () if isinstance(check, ProfileCheck) else (check.feature,)
-
-
-def _limits(check: SizeCheck | ZoneCheck | PairCheck | ProfileCheck, nominal: float) -> tuple[float, float]:
-    if isinstance(check, ZoneCheck | ProfileCheck):
-        return 0.0, check.tolerance or 0.0
-    if check.tolerance is not None:
-        return nominal - check.tolerance, nominal + check.tolerance
-    return nominal + (check.lower or 0.0), nominal + (check.upper or 0.0)
-
-
-def _profile(check: ProfileCheck, judging: _Judging) -> Measured:
-    deviations = judging.deviations
-    if deviations is None:  # made before whenever a check asks for it
-        raise ValueError(check.kind)
-    return Measured(float(np.quantile(np.abs(deviations.signed_mm), check.quantile)), judging.point_sigma_mm)
-
-
-def _judged(result: CheckResult, found: Measured) -> CheckResult:
-    zone = result.lower == 0.0 and result.kind in {"flatness", "form", "position", "profile"}
-    middle = 0.0 if zone else (result.lower + result.upper) / 2
-    half = result.upper if zone else (result.upper - result.lower) / 2
-    verdict = judge(result.name, found.value - middle, half, found.standard_uncertainty).verdict
-    return replace(result, measured=found.value, expanded_uncertainty=2 * found.standard_uncertainty, verdict=verdict)
-
-
-def _verdict(checks: Sequence[CheckResult], spec: InspectionSpec, field: FieldError, problems: Mapping[str, str]) -> tuple[Verdict, tuple[str, ...]]:
-    """As `measure.decision.overall`, on checks with units of their own."""
-    gaps = [] if checks else ["no tolerances given"]
-    gaps += [f"{name} could not be measured: {text}" for name, text in problems.items() if not any(name in check.features for check in checks)]
-    if isinstance(field, UnknownField) and checks:
-        gaps.append(f"{field.words}: name the calibration and the session, or state point_expanded_uncertainty_mm")
-    reasons = [check.reason for check in checks if check.verdict != "conform"]
-    if any(check.verdict == "reject" for check in checks):
-        return "reject", (*reasons, *gaps)
-    if reasons or gaps:
-        return "not_proven", (*reasons, *gaps)
-    tightest = max(checks, key=lambda check: check.share)
-    return "conform", (f"all {len(checks)} tolerances of {spec.name} are kept; the tightest is {tightest.reason}",)
-
-
 def _deviations(cloud: MeasuredCloud, surface: NominalSurface, aligned: _Aligned, model: Model, spec: InspectionSpec) -> DeviationMap:
     points = se3.apply(model.alignment(), aligned.cloud.points_mm)
     near = surface.nearest(points)
@@ -329,3 +246,21 @@ def _alignment_result(spec: InspectionSpec, aligned: _Aligned, model: Model, cov
     gradient[:3, -3:] = -se3.hat(middle)
     sigma = np.sqrt(np.maximum(np.diag(covariance.of(gradient)), 0.0))
     return AlignmentResult("best_fit", part_from_base, aligned.fitted.rms_mm, 2 * sigma[:3], 2 * sigma[3:])
+
+
+def _named(correlation: Correlation | None) -> dict[str, object]:
+    return {} if correlation is None else {"correlation": f"{correlation.id[:12]}, version {correlation.version}"}
+
+
+def _on_correlation(correlation: Correlation | None, checks: Sequence[CheckResult]) -> list[str]:
+    """What a person should know of it."""
+    if correlation is None:
+        return []
+    missing = [name for name in correlation.offsets if name not in {check.name for check in checks}]
+    notes = [f"the correlation names {', '.join(missing)}, which no tolerance of this inspection is called"] if missing else []
+    bent = [check.name for check in checks if check.corrected is not None and not check.corrected.slope_is_one]
+    if bent:
+        notes.append(
+            f"{', '.join(bent)}: the reference gauge sees other differences between parts than spherecal (slope not 1), which no offset cures"
+        )
+    return notes

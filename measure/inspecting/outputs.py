@@ -65,7 +65,13 @@ def features_csv(inspection: Inspection) -> str:
     """One line a figure of a feature; the form's line is called form."""
     rows: list[list[object]] = []
     for feature in inspection.features:
-        common = [feature.name, feature.kind, feature.n_points, feature.problem or ""]
+        common = [
+            feature.name,
+            feature.kind,
+            feature.n_points,
+            None if feature.coverage is None else feature.coverage.seen_deg,
+            feature.problem or "",
+        ]
         for value in feature.values:
             deviation = "" if value.nominal is None else value.measured - value.nominal
             rows.append([*common, value.name, value.unit, value.nominal, value.measured, deviation, value.expanded_uncertainty])
@@ -73,17 +79,20 @@ def features_csv(inspection: Inspection) -> str:
             rows.append([*common, "form", "mm", 0.0, feature.form_mm, feature.form_mm, feature.form_expanded_uncertainty_mm])
         else:
             rows.append([*common, *[""] * 6])
-    return _csv(["feature", "kind", "points", "problem", "figure", "unit", "nominal", "measured", "deviation", "expanded_uncertainty"], rows)
+    heads = ["feature", "kind", "points", "circumference_seen_deg", "problem", "figure", "unit", "nominal", "measured", "deviation"]
+    return _csv([*heads, "expanded_uncertainty"], rows)
 
 
 def checks_csv(inspection: Inspection) -> str:
     """One line a tolerance."""
-    rows: list[list[object]] = [
-        [c.name, c.kind, " ".join(c.features), c.unit, c.nominal, c.lower, c.upper, c.measured, c.expanded_uncertainty, c.verdict, c.problem or ""]
-        for c in inspection.checks
-    ]
+    rows: list[list[object]] = []
+    for c in inspection.checks:
+        raw = [c.name, c.kind, " ".join(c.features), c.unit, c.nominal, c.lower, c.upper, c.measured, c.expanded_uncertainty, c.verdict]
+        told = c.corrected
+        corrected = [None] * 3 if told is None else [told.value_mm, told.expanded_uncertainty_mm, told.offset_mm]
+        rows.append([*raw, c.problem or c.doubt or "", *corrected, "corrected" if c.judged_corrected else "measured"])
     heads = ["name", "kind", "features", "unit", "nominal", "lower", "upper", "measured", "expanded_uncertainty", "verdict", "problem"]
-    return _csv(heads, rows)
+    return _csv([*heads, "corrected", "corrected_expanded_uncertainty", "offset", "judged"], rows)
 
 
 def _csv(heads: list[str], rows: list[list[object]]) -> str:

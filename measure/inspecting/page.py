@@ -42,6 +42,9 @@ class CheckRow:
     """Share of the tolerance."""
     mark: str
     tone: str
+    corrected: str = ""
+    """By a correlation, with its U."""
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +58,8 @@ class FeatureRow:
     values: tuple[tuple[str, str, str, str, str], ...]
     """Name, measured, nominal, deviation, U."""
     problem: str
+    seen: str = ""
+    """How much of its circumference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +73,7 @@ class InspectionPage:
     reasons: tuple[str, ...]
     remarks: tuple[str, ...]
     checks: tuple[CheckRow, ...]
+    has_corrected: bool
     features: tuple[FeatureRow, ...]
     statistics: tuple[tuple[str, str], ...]
     pictures: tuple[Picture, ...]
@@ -88,6 +94,7 @@ def page_of(inspection: Inspection, moment: datetime.datetime) -> InspectionPage
         reasons=inspection.reasons,
         remarks=inspection.notes,
         checks=tuple(_check_row(check) for check in inspection.checks),
+        has_corrected=any(check.corrected is not None for check in inspection.checks),
         features=tuple(_feature_row(feature) for feature in inspection.features),
         statistics=_statistics(inspection),
         pictures=_pictures(inspection),
@@ -122,14 +129,17 @@ def _check_row(check: CheckResult) -> CheckRow:
         f"{100 * check.share:.0f} %",
         _WORDS[check.verdict],
         _TONES[check.verdict],
+        "" if check.corrected is None else f"{check.corrected.value_mm:.3f} (U {check.corrected.expanded_uncertainty_mm:.3f})",
+        "judged by the corrected value" if check.judged_corrected else check.doubt or "",
     )
 
 
 def _feature_row(feature: FeatureResult) -> FeatureRow:
     if feature.problem is not None:
         return FeatureRow(feature.name, feature.kind, "", "", (), feature.problem)
+    seen = "" if feature.coverage is None else f"{feature.coverage.seen_deg:.0f}°"
     form = f"{feature.form_mm:.3f} (U {feature.form_expanded_uncertainty_mm:.3f})"
-    return FeatureRow(feature.name, feature.kind, str(feature.n_points), form, tuple(_value_row(value) for value in feature.values), "")
+    return FeatureRow(feature.name, feature.kind, str(feature.n_points), form, tuple(_value_row(value) for value in feature.values), "", seen)
 
 
 def _value_row(value: Value) -> tuple[str, str, str, str, str]:

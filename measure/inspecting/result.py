@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import GUARD_FACTOR, Verdict
+from measure.inspecting.coverage import Coverage
 
 RESULT_FORMAT = "spherecal-inspection-result/1"
 
@@ -49,6 +50,8 @@ class FeatureResult:
     form_mm: float = float("nan")
     form_expanded_uncertainty_mm: float = float("nan")
     values: tuple[Value, ...] = ()
+    coverage: Coverage | None = None
+    """Of a round feature."""
 
     def to_json_dict(self) -> dict[str, object]:
         """What `--json` holds of it."""
@@ -60,7 +63,31 @@ class FeatureResult:
             "rms_mm": self.rms_mm,
             "form_mm": self.form_mm,
             "form_expanded_uncertainty_mm": self.form_expanded_uncertainty_mm,
+            "circumference_seen_deg": None if self.coverage is None else self.coverage.seen_deg,
+            "circumference_largest_gap_deg": None if self.coverage is None else self.coverage.largest_gap_deg,
             "values": {value.name: value.to_json_dict() for value in self.values},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Corrected:
+    """A value brought to a reference gauge by a correlation; never shown without the raw one."""
+
+    value_mm: float
+    expanded_uncertainty_mm: float
+    """The offset's own part in it."""
+    offset_mm: float
+    offset_expanded_uncertainty_mm: float
+    slope_is_one: bool
+
+    def to_json_dict(self) -> dict[str, object]:
+        """What `--json` holds of it."""
+        return {
+            "value_mm": self.value_mm,
+            "expanded_uncertainty_mm": self.expanded_uncertainty_mm,
+            "offset_mm": self.offset_mm,
+            "offset_expanded_uncertainty_mm": self.offset_expanded_uncertainty_mm,
+            "slope_is_one": self.slope_is_one,
         }
 
 
@@ -82,6 +109,18 @@ class CheckResult:
     expanded_uncertainty: float
     verdict: Verdict
     problem: str | None = None
+    doubt: str | None = None
+    """Why it is not judged though there is a value."""
+    corrected: Corrected | None = None
+    judged_corrected: bool = False
+    """Whether the verdict is of the corrected value."""
+
+    @property
+    def judged(self) -> tuple[float, float]:
+        """The value that the verdict is of, and its U; NaN where there is none."""
+        if self.judged_corrected and self.corrected is not None:
+            return self.corrected.value_mm, self.corrected.expanded_uncertainty_mm
+        return float("nan") if self.measured is None else self.measured, self.expanded_uncertainty
 
     @property
     def share(self) -> float:
@@ -89,7 +128,8 @@ class CheckResult:
         if self.measured is None:
             return float("nan")
         middle, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2
-        return (self.measured / self.upper) if self.kind in ZONES else abs(self.measured - middle) / half
+        value = self.judged[0]
+        return value / self.upper if self.kind in ZONES else abs(value - middle) / half
 
     @property
     def reason(self) -> str:
@@ -98,8 +138,12 @@ class CheckResult:
             return f"{self.name}: not measured ({self.problem})"
         unit = self.unit
         limits = f"at most {self.upper:.3f} {unit}" if self.kind in ZONES else f"allowed {self.lower:.3f} to {self.upper:.3f} {unit}"
-        figures = f"{self.name}: {self.measured:.3f} {unit} (U {self.expanded_uncertainty:.3f}), {limits}"
-        guard = GUARD_FACTOR * self.expanded_uncertainty / 2
+        value, width = self.judged
+        corrected = f" corrected from {self.measured:.3f}" if self.judged_corrected else ""
+        figures = f"{self.name}: {value:.3f} {unit}{corrected} (U {width:.3f}), {limits}"
+        if self.doubt is not None:
+            return f"{figures}, not judged: {self.doubt}"
+        guard = GUARD_FACTOR * width / 2
         if self.verdict == "conform":
             return f"{figures}, kept"
         return f"{figures}, {'missed by more than' if self.verdict == 'reject' else 'within'} the guard band of {guard:.3f} {unit}"
@@ -118,6 +162,9 @@ class CheckResult:
             "expanded_uncertainty": self.expanded_uncertainty,
             "verdict": self.verdict,
             "problem": self.problem,
+            "doubt": self.doubt,
+            "corrected": None if self.corrected is None else self.corrected.to_json_dict(),
+            "judged": "corrected" if self.judged_corrected else "measured",
         }
 
 

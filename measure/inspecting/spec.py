@@ -45,7 +45,12 @@ class _Feature(StrictModel):
     """How much of the region's rim is left out: fused points at edges lie inside the material."""
 
 
-class SphereFeature(_Feature):
+class _RoundFeature(_Feature):
+    least_seen_deg: Annotated[float, Field(gt=0, le=360)] = 90.0
+    """Arc of the circumference that must be seen before anything is judged by the feature."""
+
+
+class SphereFeature(_RoundFeature):
     """A sphere; with `axis` and `cap_deg` only the cap within that angle of the axis is used."""
 
     kind: Literal["sphere"]
@@ -66,7 +71,7 @@ class PlaneFeature(_Feature):
     direction: Direction | None = None
 
 
-class CylinderFeature(_Feature):
+class CylinderFeature(_RoundFeature):
     """A round boss or bore, `length_mm` long, half of it on each side of the centre."""
 
     kind: Literal["cylinder"]
@@ -77,7 +82,7 @@ class CylinderFeature(_Feature):
     hole: bool = False
 
 
-class ConeFeature(_Feature):
+class ConeFeature(_RoundFeature):
     """A cone of `diameter_mm` at its centre that opens towards its axis by the full angle; `length_mm` as for a cylinder."""
 
     kind: Literal["cone"]
@@ -89,7 +94,7 @@ class ConeFeature(_Feature):
     hole: bool = False
 
 
-class _Outline(_Feature):
+class _Outline(_RoundFeature):
     centre_mm: Vector3
     axis: Direction
     """Normal of the outline's plane, out of the material."""

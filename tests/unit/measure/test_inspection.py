@@ -23,6 +23,7 @@ from drivers.kinematics.se3 import FloatArray
 from drivers.simulated.workpiece_machined import MachinedPart
 from measure.cli import app
 from measure.cli_run import run_app
+from measure.gauge.correlation import Correlation, Offset, save_correlation
 from measure.inspecting.fitting import Response
 from measure.inspecting.inspection import inspect_cloud
 from measure.inspecting.outputs import require_replaceable, write_outputs
@@ -199,6 +200,17 @@ def test_the_command_rejects_with_3_and_tells_a_bad_cloud_with_1(tmp_path: Path,
     ]
     assert run_app(app, [*words, "-o", str(tmp_path / "out")]) == 3
     assert json.loads(capfd.readouterr().out)["verdict"] == "reject"
+    assert run_app(app, [*words, "-o", str(tmp_path / "two"), "--judge-corrected"]) == 1
+    capfd.readouterr()
+    offset = Offset(-0.2, 0.01, 0.01, 5, 1.0, slope_is_one=True)
+    save_correlation(Correlation({"diameter bore": offset}), tmp_path / "correlation.yaml")
+    words += ["--correlation", str(tmp_path / "correlation.yaml")]
+    assert run_app(app, [*words, "-o", str(tmp_path / "raw")]) == 3
+    raw = json.loads(capfd.readouterr().out)["checks"][0]
+    assert raw["corrected"]["value_mm"] == pytest.approx(raw["measured"] - 0.2)
+    assert run_app(app, [*words, "-o", str(tmp_path / "corrected"), "--judge-corrected"]) == 0
+    assert "judged by the corrected value" in (tmp_path / "corrected" / "inspection.html").read_text()
+    capfd.readouterr()
     (tmp_path / "cloud.ply").write_bytes(b"")
     assert run_app(app, [*words, "-o", str(tmp_path / "two")]) == 1
     assert json.loads(capfd.readouterr().out)["error"]["type"] == "FileError"
