@@ -59,6 +59,10 @@ def tell_verification(console: Console, result: VerifyResult) -> None:
         console.table("lengths, mm", ["between", "measured", "certified", "error", "U (k=2)", "not judged"], rows)
     tell_probing(console, result)
     tell_slides(console, result)
+    if result.external is not None:
+        found = result.external
+        row: list[object] = [len(found.points), found.rms_mm, found.expected_rms_mm, found.max_mm]
+        console.table("external reference points: robot less reference, mm", ["points", "rms", "rms expected", "largest"], [row])
     tell_rejected(console, [(result.session_name(shot.session), shot.index, shot.reason) for shot in result.rejected])
     for warning in result.warnings:
         console.note(f"warning: {warning}")

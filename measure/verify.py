@@ -21,7 +21,7 @@ import numpy as np
 
 from acquire.cell import Cell, CertifiedLength, Limits, Sphere, cell_of_session, robot_model_of
 from calibrate.normal import NoiseModel
-from calibrate.observations import Observations, RejectedShot, SphereShot
+from calibrate.observations import Observations, SphereShot
 from calibrate.second_look import see_sessions
 from calibrate.temperature import artefact_when_seen, temperature_changes
 from drivers.errors import DataError
@@ -30,6 +30,7 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import overall
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
+from measure.proof.external import external_figures, judgeable
 from measure.proof.judging import gaps_of, judgements
 from measure.proof.lengths import length_results
 from measure.proof.poses import repeated_poses, training_shots
@@ -42,8 +43,6 @@ from measure.verify_result import SessionName, VerifyResult
 
 Placing = Callable[[SphereShot, FloatArray], FloatArray]
 """Moves points (n, 3) of a shot from the camera to the base."""
-
-_EXTERNAL = "external reference point: verification looks at spheres through the camera"
 
 
 def verify(
@@ -73,7 +72,7 @@ def verify(
     cells = [cell or cell_of_session(session) for session in sessions]
     marks = [mark for session, its_cell in zip(sessions, cells, strict=True) for mark in check_fits(calibration, session, its_cell)]
     flattery = _flattery(calibration, sessions, allowed=allow_training_data)
-    observations = _gather(sessions, cells)
+    observations = _gather(calibration, sessions, cells)
     artefact = artefact_when_seen(*_merged(cells), sessions)
     found = verify_observations(
         calibration,
@@ -125,6 +124,7 @@ def verify_observations(
     volume = volume_figures(lengths, cell.work_volume_box_mm)
     outside = shots_outside(calibration, observations.shots)
     judged = () if limits is None else judgements(limits, figures, lengths, cell.spheres)
+    external = external_figures(calibration, observations.external)
     verdict, reasons = overall(judged, gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery))
     return VerifyResult(
         calibration_id=calibration.id,
@@ -143,7 +143,12 @@ def verify_observations(
         probing=() if line_profile else probing_of_views(views, figures, sizes),
         volume=volume,
         outside=outside,
-        warnings=(*warnings_of(outside, len(observations.shots)), *(() if volume is None else volume.warnings())),
+        warnings=(
+            *warnings_of(outside, len(observations.shots)),
+            *(() if volume is None else volume.warnings()),
+            *(() if external is None else external.warnings()),
+        ),
+        external=external,
         maps=residual_maps(observations.shots, views, figures, sizes),
     )
 
@@ -218,18 +223,19 @@ def _refused(message: str, where: tuple[Session, int]) -> DataError:
     )
 
 
-def _gather(sessions: Sequence[Session], cells: Sequence[Cell]) -> Observations:
+def _gather(calibration: JudgedSystem, sessions: Sequence[Session], cells: Sequence[Cell]) -> Observations:
     parts = [see_sessions([s], cell=c, model=robot_model_of(c, s)) for s, c in zip(sessions, cells, strict=True)]
     shots = sorted((shot for part in parts for shot in part.shots), key=lambda shot: shot.key)
-    external = tuple(RejectedShot(shot.session, shot.index, _EXTERNAL) for part in parts for shot in part.external)
-    rejected = tuple(shot for part in parts for shot in part.rejected) + external
-    if not shots and len(external) == len(rejected) > 0:
+    external = [shot for part in parts for shot in part.external]
+    judged, not_judged = judgeable(calibration, external)
+    rejected = (*(shot for part in parts for shot in part.rejected), *not_judged)
+    if not shots and external and not any(part.rejected for part in parts):
         remedy = "Name a session with shots of spheres; `spherecal calibrate` itself judges the robot on points left out."
         raise DataError("the session holds external reference points alone; verification looks at spheres", file=sessions[0].folder, remedy=remedy)
     if not shots:
         why = f"; the first refusal was: {rejected[0].reason}" if rejected else ""
         raise DataError(f"none of {len(rejected)} shots shows a sphere{why}", file=sessions[0].folder, remedy="Capture shots of the spheres.")
-    return Observations(tuple(shots), rejected)
+    return Observations(tuple(shots), rejected, judged)
 
 
 def _merged(cells: Sequence[Cell]) -> tuple[dict[str, Sphere], list[CertifiedLength]]:

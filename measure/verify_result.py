@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from acquire.cell import Limits
 from calibrate.observations import Observations, RejectedShot
 from measure.decision import GUARD_FACTOR, RULE, Judgement, Verdict
+from measure.proof.external import ExternalFigures
 from measure.proof.lengths import LengthResult
 from measure.proof.probing import Probing, ProbingResult
 from measure.proof.reach import OutsideShot
@@ -56,6 +57,8 @@ class VerifyResult:
     """Shots beyond the camera volume or axis ranges that the calibration saw."""
     warnings: tuple[str, ...] = ()
     """What a reader must know of these figures besides the verdict's reasons."""
+    external: ExternalFigures | None = None
+    """External reference points, told beside the spheres and not judged against a limit; None where there was none to judge."""
     maps: ResidualMaps | None = field(default=None, repr=False)
     """What the report draws of the points."""
 
@@ -96,6 +99,7 @@ class VerifyResult:
             "spheres": {name: _sphere_json(sphere, self._probing_of(name)) for name, sphere in self.figures.spheres.items()},
             "volume": None if self.volume is None else self.volume.to_json_dict(),
             "probing": [self._view_json(p) for p in self.probing if p.session is not None],
+            "external": None if self.external is None else self.external.to_json_dict(self.session_name),
             "outside": [{"session": self.session_name(s.session), "index": s.index, "sphere": s.sphere, "what": list(s.what)} for s in self.outside],
             "warnings": list(self.warnings),
             "verdict": self.verdict,

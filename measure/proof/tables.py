@@ -10,7 +10,7 @@ from measure.verify_result import VerifyResult
 
 def proof_tables(result: VerifyResult) -> tuple[Table, ...]:
     """Those that have anything to say."""
-    return tuple(table for table in (_probing(result), _slides(result), _outside(result)) if table.rows)
+    return tuple(table for table in (_probing(result), _slides(result), _external(result), _outside(result)) if table.rows)
 
 
 def _probing(result: VerifyResult) -> Table:
@@ -40,6 +40,23 @@ def _slides(result: VerifyResult) -> Table:
         f"| |P1 - P2| - L | of single views of both ends, no two of a pair from the same robot pose. {CAUTION}",
         ("slide", "pairs", "mean, mm", "max, mm", "std, mm", "signed mean, mm", "refused"),
         tuple(slide_rows(result.slides)),
+    )
+
+
+def _external(result: VerifyResult) -> Table:
+    found = result.external
+    rows = []
+    for point in () if found is None else found.points:
+        errors = [f"{e:+.3f} ± {u:.3f}" for e, u in zip(point.error_mm, point.expanded_uncertainty_mm, strict=True)]
+        name = f"{result.session_name(point.session)}, shot {point.index}"
+        rows.append((name, point.reference, point.target, *errors, f"{point.distance_mm:.3f}"))
+    together = "" if found is None else f"All together: {found.rms_mm:.3f} rms, where these uncertainties expect {found.expected_rms_mm:.3f}. "
+    return Table(
+        "External reference points",
+        "Where the calibrated robot expects a target minus where the reference saw it, in the base, with U (k = 2) of this difference: calibration "
+        f"of robot, reference and target, pose noise, noise of the reference. {together}The camera does not come in. Told and not judged. mm.",
+        ("point", "reference", "target", "x", "y", "z", "distance"),
+        tuple(rows),
     )
 
 

@@ -25,13 +25,15 @@ from tests.support.tracker import add_tracker_lines, tracked_robot, tracker_cell
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with sessions `tracker` and `mixed`."""
+    """A folder with sessions `tracker`, `mixed` and `unseen`."""
     folder, rng = tmp_path_factory.mktemp("external"), np.random.default_rng(71)
     robot = tracked_robot(72)
     write_tracker_session(folder / "tracker", robot.shots(rng, 25), tracker_cell_data("abb_irb1410"))
     cell = replace(paper_cell(), nominal=abb_robot(), true=with_table_1_errors(abb_robot()))
     write_session(folder / "mixed", cell, {"A": draw_shots(cell, rng, 12, n_points=120)}, flange_from_camera=None)
     add_tracker_lines(folder / "mixed", replace(robot, noise_mm=0.0).shots(rng, 3))
+    write_session(folder / "unseen", cell, {"A": draw_shots(cell, rng, 6, n_points=120)}, flange_from_camera=None)
+    add_tracker_lines(folder / "unseen", replace(robot, noise_mm=0.0).shots(rng, 4))
     return folder
 
 
@@ -79,7 +81,16 @@ def test_mixed_sessions_are_verified_stitched_and_searched_on_their_scans(sessio
     assert (data["n_shots"], data["used"]) == (15, 15)
     code, data = told(capfd, "verify", tmp_path / "c.yaml", sessions / "mixed", "--allow-training-data")
     assert code in {0, 3}
-    assert data["n_shots"] == 15  # three of them rejected: they have no scan
+    assert (data["n_shots"], data["external"]) == (15, None)  # three of them rejected: the calibration was made from them
+    code, data = told(capfd, "verify", tmp_path / "c.yaml", sessions / "unseen")
+    assert code in {0, 3}
+    external = data["external"]
+    assert isinstance(external, dict)
+    assert (data["n_shots"], data["used"], data["rejected"], external["n_points"]) == (10, 6, [], 4)
+    assert [(p["session"], p["index"], p["target"]) for p in external["points"]] == [("unseen", i, "reflector") for i in range(6, 10)]
+    code, _ = told(capfd, "report", tmp_path / "c.yaml", sessions / "unseen", "-o", tmp_path / "report.html")
+    assert code == 0
+    assert "unseen, shot 9" in (tmp_path / "report.html").read_text()
     code, data = told(capfd, "centres", sessions / "mixed", "-o", tmp_path / "centres.csv")
     assert (code, data["n_shots"], data["used"]) == (0, 12, 12)
     code, data = told(capfd, "stitch", tmp_path / "c.yaml", sessions / "mixed", "-o", tmp_path / "cloud.ply")
