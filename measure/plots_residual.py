@@ -13,7 +13,7 @@ from measure.proof.residual_maps import BinnedMap, CameraMaps, FormMap
 _EMPTY_COLOUR = "#d1d5db"
 _COLOURS = "RdBu_r"
 _SMALLEST_MM = 1e-3
-_ARROW_SHARE = 0.12
+_ARROW_SHARE, _LONE_ARROW_SHARE = 0.12, 0.4
 _LEAST_SPAN_MM = 100.0
 
 
@@ -72,10 +72,14 @@ def shifts_svg(place_in_base_mm: FloatArray, shift_mm: FloatArray, *, exaggerati
 
 
 def exaggeration_of(place_in_base_mm: FloatArray, shift_mm: FloatArray) -> float:
-    """A round factor (1, 2 or 5 times a power of ten) at which a large arrow (n, 3) is an eighth of the picture of its places (n, 3)."""
-    span = max(float(np.ptp(place_in_base_mm, axis=0).max()), _LEAST_SPAN_MM)
+    """A round factor (1, 2 or 5 times a power of ten) for arrows (n, 3) from places (n, 3).
+
+    A large arrow then takes up to an eighth of the picture, and more where all start at one place.
+    """
+    span = float(np.ptp(place_in_base_mm, axis=0).max())
+    share = _ARROW_SHARE if span > _LEAST_SPAN_MM else _LONE_ARROW_SHARE
     large = max(float(np.quantile(np.linalg.norm(shift_mm, axis=1), 0.95)), 1e-6)
-    wanted = _ARROW_SHARE * span / large
+    wanted = share * max(span, _LEAST_SPAN_MM) / large
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(max(step for step in (1, 2, 5) if step * power <= wanted) * power)
 

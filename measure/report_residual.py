@@ -52,9 +52,9 @@ def _camera_picture(maps: ResidualMaps) -> Picture:
 
 
 def _form_picture(maps: ResidualMaps, n_spheres: int) -> Picture:
-    which = f"The {MOST_SPHERES} of {n_spheres} spheres with the largest form error, all" if n_spheres > MOST_SPHERES else "All"
+    which = f"The {MOST_SPHERES} of {n_spheres} spheres with the largest form error. " if n_spheres > MOST_SPHERES else ""
     caption = (
-        f"{which} on one colour scale: stitched points of all views less their own best-fit sphere, mean over 15°, azimuth from the base's x about "
+        f"{which}Stitched points of all views less their own best-fit sphere, mean over 15°, azimuth from the base's x about "
         "its z. Red stands out. Good: pale and patchy. An edge between two colours is a step between views that do not agree; red and blue in halves "
         "or quarters that return on every sphere are an error of robot or hand-eye; a spot on one sphere alone is dirt or damage. "
         f"Grey: fewer than {LEAST_IN_BIN} points."
