@@ -13,8 +13,9 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.distance import NominalSurface
 from measure.inspecting.features import PartCloud
-from measure.inspecting.fitting import PatchSums, Response, patch_covariance, patches_of
+from measure.inspecting.fitting import Response
 from measure.inspecting.geometry import Element
+from measure.inspecting.patches import PatchSums, patch_covariance, patches_of
 
 _THINNED = 5_000
 _ROUNDS = 50

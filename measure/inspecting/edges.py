@@ -14,7 +14,7 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.coverage import along_outline
-from measure.inspecting.fitting import IntArray
+from measure.inspecting.patches import IntArray
 from measure.inspecting.shapes import StadiumShape
 
 _FEWEST_POINTS = 60

@@ -12,7 +12,8 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.edges import rim_points
-from measure.inspecting.fitting import Fit, FitPoints, IntArray, fit_shape
+from measure.inspecting.fitting import Fit, FitPoints, fit_shape
+from measure.inspecting.patches import IntArray
 from measure.inspecting.shapes import ConeShape, Hollow, PlaneShape, Shape, SphereShape, StadiumShape, cylinder, frame_about
 from measure.inspecting.spec import CircleFeature, ConeFeature, CylinderFeature, Feature, PlaneFeature, SlotFeature, SphereFeature
 
@@ -83,7 +84,8 @@ def fit_feature(name: str, feature: Feature, cloud: PartCloud, others: Mapping[s
         # what moves the whole rim alike shows in no residual: half the spacing's width, as a rectangle
         doubt = np.zeros_like(fit.covariance)
         doubt[shape.names.index("radius"), shape.names.index("radius")] = spacing_mm**2 / 3
-        return replace(fit, covariance=fit.covariance + doubt)
+        # a rim is seen by whoever sees the surface round it
+        return replace(fit, covariance=fit.covariance + doubt, response=replace(fit.response, surface=None))
     return fit_shape(shape, FitPoints(cloud.points_mm[rows], cloud.weights[rows], rows, cloud.voxel_mm), name=name)
 
 

@@ -22,26 +22,36 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.coverage import Coverage, coverage_of, on_seen_sectors
+from measure.inspecting.patches import IntArray, PatchSums, patch_covariance, patches_of
 from measure.inspecting.shapes import Distances, Shape
-
-IntArray = NDArray[np.int64]
 
 _THINNED = 6_000
 _ROUNDS = 25
 _TUKEY = 4.685
 _CUT = 4.0
+_WIDER_FOR_RAW = 1.5
 _VOXELS = 0.5
 _SMALLEST_SCALE_MM = 1e-5
 _LONGEST_STEP_MM = 0.5
-_CELLS_ACROSS = 6
-_COARSE_CELLS_ACROSS = 3
-_LEAST_FREEDOM = 3
 _FEWEST_PER_PARAMETER = 5
 _LARGEST_TURN_RAD = 0.15
 _LOOK = "Look at alignment, nominal and search_mm, and whether the scans show the place."
 _MOST_CONDITION = 1e5
-_LEAST_LEFT = 0.02
-"""Of a parameter's hold, where a patch is all that holds it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A fitted shape as the place where points belong to it."""
+
+    shape: Shape
+    params: FloatArray
+    """(p,)."""
+    limit_mm: float
+
+    def holds(self, in_part_mm: FloatArray) -> NDArray[np.bool_]:
+        """(n,) which points (n, 3) lie on it, in its region."""
+        local = se3.apply(self.shape.local_from_part, in_part_mm)
+        return np.asarray(self.shape.near(local) & (np.abs(self.shape.distances(self.params, local).residual_mm) <= self.limit_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +66,8 @@ class Response:
     """Edge of a patch."""
     outward: FloatArray
     """(p,) change per mm by which the whole surface moves out of the material."""
+    surface: Surface | None = None
+    """What tells the points that a view has of it from those beside it; None where the points' place alone must do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,18 +199,21 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     gain = np.asarray(-np.linalg.solve(weighted.T @ found.jacobian, weighted.T).T, dtype=np.float64)
     labels, size_mm = patches_of(points.in_part_mm)
     patches = PatchSums(labels, points.weights)
+    rms_mm = float(np.sqrt(np.average(found.residual_mm**2, weights=points.weights)))
     response = Response(
         centre_in_part_mm=patches.mean(points.in_part_mm),
         by_patch=patches.total((gain[:, :, None] * gradient[:, None, :]).reshape(len(gain), -1)).reshape(len(patches.weights), -1, 3),
         size_mm=size_mm,
         outward=np.asarray(gain.sum(axis=0) * shape.outward),
+        # single points scatter more than means of voxels do
+        surface=Surface(shape, params, _WIDER_FOR_RAW * _CUT * max(rms_mm, _SMALLEST_SCALE_MM)),
     )
     return Fit(
         shape=shape,
         params=params,
         covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm, found.jacobian),
         response=response,
-        rms_mm=float(np.sqrt(np.average(found.residual_mm**2, weights=points.weights))),
+        rms_mm=rms_mm,
         rows=points.rows,
         n_rejected=n_rejected,
         patch_residual_mm=patches.mean(found.residual_mm[:, None])[:, 0],
@@ -207,77 +222,3 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
         patch_normal=patches.mean(gradient),
         coverage=coverage_of(shape, local, params),
     )
-
-
-class PatchSums:
-    """Sums and means of rows by patch."""
-
-    def __init__(self, labels: IntArray, weights: FloatArray) -> None:
-        self._labels = labels
-        self._weights = weights
-        self.counts: IntArray = np.bincount(labels).astype(np.int64)
-        """(K,) rows of each patch."""
-        self.weights: FloatArray = np.maximum(np.bincount(labels, weights), 1e-12)
-        """(K,) their weights."""
-
-    def total(self, values: FloatArray) -> FloatArray:
-        """(K, m) plain sums of values (n, m)."""
-        return np.column_stack([np.bincount(self._labels, column, len(self.counts)) for column in values.T])
-
-    def mean(self, values: FloatArray) -> FloatArray:
-        """(K, m) weighted means of values (n, m)."""
-        return np.asarray(self.total(values * self._weights[:, None]) / self.weights[:, None])
-
-
-def patches_of(points_mm: FloatArray, cells_across: int = _CELLS_ACROSS) -> tuple[IntArray, float]:
-    """Cubes of a grid as patches: labels (n,) from 0 without gaps, and the edge of a cube."""
-    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    size = max(float((high - low).max()) / cells_across, 1e-6)
-    cells = np.minimum(np.floor((points_mm - low) / size), cells_across - 1).astype(np.int64)
-    keys = (cells[:, 0] * cells_across + cells[:, 1]) * cells_across + cells[:, 2]
-    taken = np.zeros(cells_across**3, dtype=np.int64)
-    taken[keys] = 1
-    return (np.cumsum(taken) - 1)[keys], size
-
-
-def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray, jacobian: FloatArray | None = None) -> FloatArray:
-    """(p, p) of parameters that answer to residuals (n,) at points (n, 3) by gains (n, p).
-
-    Patches of two sizes, since nobody knows how far neighbours have errors in common: each variance is the larger one.
-    With the residuals' derivatives (n, p) it is what the fit changes by where one patch is left out (the jackknife by
-    groups, CR3 of R. M. Bell and D. F. McCaffrey, Survey Methodology 28, 2002): a patch that alone holds a parameter
-    has small residuals because of that, and would else pass for a good one.
-    """
-    scores = gain * residual_mm[:, None]
-    pull = None if jacobian is None else gain[:, :, None] * jacobian[:, None, :]
-    fine, coarse = (_by_patches(scores, pull, patches_of(points_mm, cells)[0]) for cells in (_CELLS_ACROSS, _COARSE_CELLS_ACROSS))
-    if fine is None:  # too few patches to tell anything
-        fine = scores.T @ scores * max(1.0, len(scores) / _CELLS_ACROSS)
-    larger = np.ones(len(fine)) if coarse is None else np.sqrt(np.maximum(np.diag(coarse) / np.maximum(np.diag(fine), 1e-300), 1.0))
-    return np.asarray(fine * np.outer(larger, larger))
-
-
-def _by_patches(scores: FloatArray, pull: FloatArray | None, labels: IntArray) -> FloatArray | None:
-    """The patches' sums of squares with Student's factor; None where there are too few patches."""
-    from scipy.special import stdtrit
-
-    patches = PatchSums(labels, np.ones(len(labels)))
-    sums = patches.total(scores)
-    freedom = len(sums) - scores.shape[1]
-    if freedom < _LEAST_FREEDOM:
-        return None
-    student = float(stdtrit(freedom, 0.975)) / 1.959964
-    if pull is None:
-        return np.asarray(sums.T @ sums * (len(sums) / freedom) * student**2)
-    p = scores.shape[1]
-    # -gain jacobian summed over all points is the identity; what is left of it without a patch
-    left = np.eye(p) + patches.total(pull.reshape(len(scores), -1)).reshape(-1, p, p)
-    sums = _without_each(left, sums)
-    return np.asarray(sums.T @ sums * ((len(sums) - 1) / len(sums)) * student**2)
-
-
-def _without_each(left: FloatArray, sums: FloatArray) -> FloatArray:
-    """(K, p) changes of the fit by leaving out each patch, which alone moves it by sums (K, p)."""
-    open_ = np.linalg.cond(left) > _MOST_CONDITION
-    left = np.where(open_[:, None, None], left + _LEAST_LEFT * np.eye(left.shape[1]), left)
-    return np.asarray(np.linalg.solve(left, sums[:, :, None])[:, :, 0])

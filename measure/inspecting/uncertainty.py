@@ -19,7 +19,8 @@ from typing import Protocol
 import numpy as np
 
 from drivers.kinematics.se3 import FloatArray
-from measure.inspecting.fitting import IntArray, Response
+from measure.inspecting.fitting import Response
+from measure.inspecting.patches import IntArray
 
 CORRELATION_LENGTHS_MM = (5.0, 20.0, 80.0, 320.0, np.inf)
 """Gaussian: exp(-d² / 2 l²). Short ones average out over a feature, long ones cancel in sizes; in between nothing does."""

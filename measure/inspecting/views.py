@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -110,7 +110,8 @@ def views_of(calibration: KnowsItsErrors, session: Session) -> list[View]:
 def seen_field(calibration: KnowsItsErrors, views: Sequence[View], responses: Sequence[Response], part_from_base: FloatArray) -> SeenField:
     """The field of errors at the patches of some responses.
 
-    A patch's error is the mean over the views that saw it, by the number of their points.
+    A patch's error is the mean over the views that saw it, by the number of their points on the feature: a wall that one
+    view sees has the whole error of that view, though others see the surface at its foot.
 
     Raises:
         DataError: no view shows the part.
@@ -118,6 +119,13 @@ def seen_field(calibration: KnowsItsErrors, views: Sequence[View], responses: Se
     centres = np.concatenate([response.centre_in_part_mm for response in responses])
     seen = [_seen_by(calibration, view, responses, part_from_base) for view in views]
     total = np.sum([one.n_points for one in seen], axis=0) if seen else np.zeros(len(centres))
+    ends = np.cumsum([len(response.centre_in_part_mm) for response in responses])
+    missed = [not part.any() for part in np.split(total, ends[:-1])]
+    if any(missed):
+        # too small for the thinned views: who sees its place tells
+        loose = [replace(response, surface=None) if gone else response for response, gone in zip(responses, missed, strict=True)]
+        seen = [_seen_by(calibration, view, loose, part_from_base) for view in views]
+        total = np.sum([one.n_points for one in seen], axis=0) if seen else total
     if not total.any():
         raise DataError("no scan of the session shows the part where the cloud does", remedy="Name the session that the cloud was stitched from.")
     n_parameters = seen[0].by_parameter.shape[2]
@@ -171,6 +179,8 @@ def _points_of(response: Response, in_part: FloatArray, in_camera: FloatArray) -
     centres = response.centre_in_part_mm
     low, high = centres.min(axis=0) - response.size_mm, centres.max(axis=0) + response.size_mm
     rows = np.flatnonzero(((in_part > low) & (in_part < high)).all(axis=1))
+    if response.surface is not None:
+        rows = rows[response.surface.holds(in_part[rows])]
     found = cKDTree(centres).query(in_part[rows], distance_upper_bound=response.size_mm)
     near, patch = np.isfinite(found[0]), np.asarray(found[1], dtype=np.int64)
     count = np.bincount(patch[near], minlength=len(centres)).astype(np.float64)

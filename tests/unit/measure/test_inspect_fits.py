@@ -11,7 +11,8 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.edges import rim_points
-from measure.inspecting.fitting import Fit, FitPoints, fit_shape, patches_of
+from measure.inspecting.fitting import Fit, FitPoints, fit_shape
+from measure.inspecting.patches import patches_of
 from measure.inspecting.shapes import ConeShape, PlaneShape, Shape, SphereShape, StadiumShape, cylinder, frame_about
 from measure.inspecting.uncertainty import StatedField, joint_covariance
 from tests.support.machined import voxel_means
