@@ -23,13 +23,14 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.coverage import Coverage, coverage_of, on_seen_sectors
 from measure.inspecting.patches import IntArray, PatchSums, patch_covariance, patches_of
-from measure.inspecting.shapes import Distances, Shape
+from measure.inspecting.shapes import ConeShape, Distances, Shape, StadiumShape
 
 _THINNED = 6_000
 _ROUNDS = 25
 _TUKEY = 4.685
 _CUT = 4.0
 _WIDER_FOR_RAW = 1.5
+_LAYERS = 4
 _VOXELS = 0.5
 _SMALLEST_SCALE_MM = 1e-5
 _LONGEST_STEP_MM = 0.5
@@ -191,6 +192,15 @@ def _step(found: Distances, weights: FloatArray, name: str) -> FloatArray:
     return np.asarray(step * min(1.0, _LONGEST_STEP_MM / max(float(np.abs(step).max()), 1e-12)))
 
 
+def _layers(shape: Shape, local: FloatArray) -> IntArray | None:
+    """(n,) which of the layers along its axis a point of a wall lies in; None where there is no wall."""
+    if not isinstance(shape, ConeShape | StadiumShape):
+        return None
+    z = local[:, 2]
+    edges = np.quantile(z, np.linspace(0, 1, _LAYERS + 1)[1:-1])
+    return np.unique(np.searchsorted(edges, z), return_inverse=True)[1].astype(np.int64)
+
+
 def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitPoints, n_rejected: int) -> Fit:
     found = shape.distances(params, local)
     gradient = found.gradient @ shape.local_from_part[:3, :3]
@@ -211,7 +221,7 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     return Fit(
         shape=shape,
         params=params,
-        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm, found.jacobian),
+        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm, found.jacobian, _layers(shape, local)),
         response=response,
         rms_mm=rms_mm,
         rows=points.rows,

@@ -48,7 +48,9 @@ def patches_of(points_mm: FloatArray, cells_across: int = _CELLS_ACROSS) -> tupl
     return (np.cumsum(taken) - 1)[keys], size
 
 
-def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray, jacobian: FloatArray | None = None) -> FloatArray:
+def patch_covariance(
+    gain: FloatArray, residual_mm: FloatArray, points_mm: FloatArray, jacobian: FloatArray | None = None, layers: IntArray | None = None
+) -> FloatArray:
     """(p, p) of parameters that answer to residuals (n,) at points (n, 3) by gains (n, p).
 
     Patches of two sizes, since nobody knows how far neighbours have errors in common: each variance is the larger one.
@@ -61,7 +63,10 @@ def patch_covariance(gain: FloatArray, residual_mm: FloatArray, points_mm: Float
     fine, coarse = (_by_patches(scores, pull, patches_of(points_mm, cells)[0]) for cells in (_CELLS_ACROSS, _COARSE_CELLS_ACROSS))
     if fine is None:  # too few patches to tell anything
         fine = scores.T @ scores * max(1.0, len(scores) / _CELLS_ACROSS)
-    larger = np.ones(len(fine)) if coarse is None else np.sqrt(np.maximum(np.diag(coarse) / np.maximum(np.diag(fine), 1e-300), 1.0))
+    variances = [np.diag(fine)] if coarse is None else [np.diag(fine), np.diag(coarse)]
+    if pull is not None and layers is not None:
+        variances.append(_by_layers(scores, pull, layers))
+    larger = np.sqrt(np.max(variances, axis=0) / np.maximum(np.diag(fine), 1e-300))
     return np.asarray(fine * np.outer(larger, larger))
 
 
@@ -77,15 +82,28 @@ def _by_patches(scores: FloatArray, pull: FloatArray | None, labels: IntArray) -
     student = float(stdtrit(freedom, 0.975)) / 1.959964
     if pull is None:
         return np.asarray(sums.T @ sums * (len(sums) / freedom) * student**2)
-    p = scores.shape[1]
-    # -gain jacobian summed over all points is the identity; what is left of it without a patch
-    left = np.eye(p) + patches.total(pull.reshape(len(scores), -1)).reshape(-1, p, p)
-    sums = _without_each(left, sums)
+    sums = _without_each(patches, pull, sums)
     return np.asarray(sums.T @ sums * ((len(sums) - 1) / len(sums)) * student**2)
 
 
-def _without_each(left: FloatArray, sums: FloatArray) -> FloatArray:
+def _by_layers(scores: FloatArray, pull: FloatArray, layers: IntArray) -> FloatArray:
+    """(p,) variances by what the fit changes by where a layer is left out: what a whole rim has in common, patches beside each other do not tell."""
+    from scipy.special import stdtrit
+
+    patches = PatchSums(layers, np.ones(len(layers)))
+    k = len(patches.counts)
+    if k < 2:
+        return np.zeros(scores.shape[1])
+    changes = _without_each(patches, pull, patches.total(scores))
+    student = float(stdtrit(max(k - 1, 2), 0.975)) / 1.959964
+    return np.asarray(np.sum(changes**2, axis=0) * (k - 1) / k * student**2)
+
+
+def _without_each(patches: PatchSums, pull: FloatArray, sums: FloatArray) -> FloatArray:
     """(K, p) changes of the fit by leaving out each patch, which alone moves it by sums (K, p)."""
+    p = sums.shape[1]
+    # -gain jacobian summed over all points is the identity; what is left of it without a patch
+    left = np.eye(p) + patches.total(pull.reshape(len(pull), -1)).reshape(-1, p, p)
     open_ = np.linalg.cond(left) > _MOST_CONDITION
-    left = np.where(open_[:, None, None], left + _LEAST_LEFT * np.eye(left.shape[1]), left)
+    left = np.where(open_[:, None, None], left + _LEAST_LEFT * np.eye(p), left)
     return np.asarray(np.linalg.solve(left, sums[:, :, None])[:, :, 0])

@@ -156,3 +156,18 @@ def test_a_correlation_that_names_no_tolerance_is_told() -> None:
     result = inspected(CLOUD, correlation=Correlation({"diameter boss": offset, "diameter bose": offset}))
     assert any("diameter bose" in note for note in result.notes)
     assert any("slope" in note for note in result.notes)
+
+
+def test_a_rim_that_stands_in_the_wall_all_round_is_charged_to_the_diameter() -> None:
+    """Points at the mouth of a bore lie off its wall on every side alike: patches side by side agree, layers do not."""
+    rng = np.random.default_rng(31)
+    clean = arc_points(360.0, 900, rng)
+    clean[:, :2] *= (1 + rng.normal(0, 0.05, 900) / 15)[:, None]
+    worn = clean.copy()
+    worn[:, :2] *= np.where(clean[:, 2] > 2.0, 1 + 0.3 * (clean[:, 2] - 2.0) / 4.0 / 15, 1.0)[:, None]
+    circle = StadiumShape(HOME, 15.0, 0.0, 6.0, 2.0)
+    fits = [fit_shape(circle, FitPoints(points, np.ones(900), np.arange(900)), name="bore") for points in (clean, worn)]
+    widths = [4 * float(np.sqrt(fit.covariance[2, 2])) for fit in fits]
+    errors = [2 * abs(float(fit.params[2])) for fit in fits]
+    assert errors[0] <= widths[0] <= 0.03
+    assert 0.05 <= errors[1] <= widths[1]
