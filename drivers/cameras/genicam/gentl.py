@@ -6,9 +6,11 @@ That is refused unless the cell file allows it: `address` (Aravis) needs no enum
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +159,8 @@ class GentlTransport:
             remedy = f"Serial numbers that it knows: {', '.join(known) or 'none'}."
             raise CameraNotReached(f"the producer knows no camera with the serial number {self._serial}", file=self._producer, remedy=remedy)
         try:
-            self._acquirer = self._harvester.create({"serial_number": self._serial})
+            with _interrupts_kept():
+                self._acquirer = self._harvester.create({"serial_number": self._serial})
         except gentl.GenericException as error:
             if "ACCESS_DENIED" in str(error).upper() or "IN_USE" in str(error).upper():
                 remedy = "Close the vendor's viewer, or whatever holds it."
@@ -181,6 +184,17 @@ def _part(component: Any) -> Part:
     data = np.array(component.data, copy=True).reshape(-1).view(np.uint8)
     # the library hands out elements without a row's padding only where there is none
     return Part(str(component.data_format), int(component.width), int(component.height), data, int(component.x_padding or 0))
+
+
+@contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """The library takes Ctrl-C for itself and never gives it back; it is the run's, which stops the robot by it."""
+    former = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, former)
 
 
 def _timestamp(buffer: Any) -> int | None:

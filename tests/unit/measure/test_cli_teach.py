@@ -68,20 +68,25 @@ def test_a_taught_plan_loads_and_holds_what_was_kept(cell_file: Path, terminal: 
 
 
 def test_an_interrupt_keeps_what_was_taught(cell_file: Path, terminal: int, tmp_path: Path, capfd: Any) -> None:
-    out = tmp_path / "plan.yaml"
+    out, ended = tmp_path / "plan.yaml", threading.Event()
 
     def press() -> None:
-        # as the terminal does it, once the first pose is on disk
+        # as the terminal does it, once the first pose is on disk; Python loses an interrupt that falls into a finaliser
         for _ in range(600):
             if out.exists():
                 break
             time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
+        while not ended.wait(0.2):
+            os.kill(os.getpid(), signal.SIGINT)
+            ended.wait(3.0)
 
     presser = threading.Thread(target=press)
     presser.start()
-    code, told, _ = run(terminal, "f", cell_file, "-o", out, "--jog", capfd=capfd)
-    presser.join()
+    try:
+        code, told, _ = run(terminal, "f", cell_file, "-o", out, "--jog", capfd=capfd)
+    finally:
+        ended.set()
+        presser.join()
     assert (code, told["n_poses"], told["state"]) == (130, 1, "interrupted")
     assert len(load_plan(out).poses) == 1
 

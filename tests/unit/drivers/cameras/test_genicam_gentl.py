@@ -5,6 +5,7 @@ viky's scene is a height map at z = 0: what depends on a camera that looks at so
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -60,6 +61,16 @@ def test_a_height_map_at_zero_is_no_scan() -> None:
     with pytest.raises(CameraMisconfigured, match="as if these were metres"):
         camera.capture(timeout_s=3)
     camera.close()
+
+
+def test_ctrl_c_stays_with_the_run() -> None:
+    """harvesters takes SIGINT when a camera is created, and keeps it: a second Ctrl-C would not stop the robot."""
+    before = signal.getsignal(signal.SIGINT)
+    camera = camera_of()
+    camera.open()
+    assert signal.getsignal(signal.SIGINT) is before
+    camera.close()
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_other_serials_and_producers_are_told() -> None:
