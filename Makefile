@@ -42,8 +42,9 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 
 # One BLAS thread a process: two processes share two cores, and on matrices this small more threads gain nothing and were seen to stall.
+# Idle workers take over what busy ones have not begun: some tests wait for seconds, others compute.
 test: lint
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal
 
 qualify: $(VENV)/.installed-dev
 	$(BIN)/pytest -m qualify -s

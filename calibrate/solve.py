@@ -202,7 +202,8 @@ def solve_observations(
 ) -> tuple[Solved, dict[str, float]]:
     """Solve with the camera error model asked for, or with the simplest that held-out shots do not tell from the best."""
     solved, compared = _solved_by_method(observations, cell, model, settings)
-    asked = settings.camera_error != "auto" and settings.method in _SOLVERS
+    # a field follows whatever the others do
+    asked = settings.camera_error not in {"auto", "field"} and settings.method in _SOLVERS
     if not asked or not solved.solution.problem.along_sight or solved.solution.held:
         return solved, compared
     others = _candidates(observations, cell, replace(settings, camera_error="auto"))

@@ -39,7 +39,7 @@ def rms(values: object) -> float:
         pytest.param(120, "random", 0.045, 0.10, 20, marks=pytest.mark.qualify),
         pytest.param(60, "chosen", 0.04, 0.10, 20, marks=pytest.mark.qualify),
         pytest.param(120, "chosen", 0.03, 0.07, 20, marks=pytest.mark.qualify),
-        (60, "chosen", 0.04, 0.10, 2),
+        (60, "chosen", 0.04, 0.10, 1),
     ],
 )
 def test_volume_accuracy_with_a_bar_in_three_orientations(n: int, choice: str, rms_mm: float, max_mm: float, n_cells: int) -> None:

@@ -81,6 +81,7 @@ class Work:
         data = parsed(self.folder / "plain.yaml")
         model = mapping(data["robot"])["model"]
         data["robot"] = {"driver": "abb_socket", "model": model, **robot}
+        data["identity"] = {**mapping(data["identity"]), "robot_serial": "SIMULATED-0001"}
         data["camera"] = {**mapping(data["camera"]), "truth": "truth.yaml", "controller": f"127.0.0.1:{at.bench_port}"}
         path = self.folder / f"{name}.yaml"
         path.write_text(dump_yaml(data))
@@ -147,7 +148,8 @@ def test_the_whole_way_over_tcp_and_over_the_serial_line_gives_what_the_plain_si
     _same_sessions(work.folder / "tcp_c", work.folder / "plain_c", same_scans=True)
     _same_sessions(work.folder / "serial_v", work.folder / "plain_v", same_scans=False)
     for name in ("tcp", "plain"):
-        run("calibrate", work.folder / f"{name}_c", "-o", work.folder / f"{name}_calibration.yaml", "--camera-error", "pillow", "-q")
+        arguments = ["calibrate", work.folder / f"{name}_c", "-o", work.folder / f"{name}_calibration.yaml", "--camera-error", "pillow", "-q"]
+        assert run_app(app, list(map(str, arguments))) in {0, 3}  # so few shots do not pass, and need not here
     centres, expected = (Calibration.load(work.folder / f"{name}_calibration.yaml").sphere_centres_in_base_mm for name in ("tcp", "plain"))
     for sphere, centre in expected.items():
         np.testing.assert_allclose(centres[sphere], centre, atol=ONE_UM)

@@ -86,7 +86,7 @@ def test_a_moving_robot_needs_somebody_who_says_so(small: SmallCell, tmp_path: P
         assert not (tmp_path / "s").exists()
 
 
-@pytest.mark.parametrize(("typed", "code"), [("yes\n", 1), ("move\n", 0)])
+@pytest.mark.parametrize(("typed", "code"), [("yes\n", 1), pytest.param("move\n", 0, marks=pytest.mark.qualify)])
 def test_the_motion_is_confirmed_by_a_typed_word(typed: str, code: int, small: SmallCell, tmp_path: Path) -> None:
     cell, plan = real_time_cell(small, tmp_path, 8.0, 0.05)
     ours, theirs = pty.openpty()
@@ -106,6 +106,7 @@ def test_the_motion_is_confirmed_by_a_typed_word(typed: str, code: int, small: S
         assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.qualify  # the keys are tested in the unit tests, an attended first run at a terminal below
 def test_step_by_step_a_pose_is_taken_skipped_or_the_end(small: SmallCell, tmp_path: Path) -> None:
     cell, plan = real_time_cell(small, tmp_path, 8.0, 0.05)
     ours, theirs = pty.openpty()
@@ -228,6 +229,7 @@ def test_the_first_run_of_a_plan_is_attended_slow_and_recorded(small: SmallCell,
     assert not runs_of(cell)[-1].stepped
 
 
+@pytest.mark.qualify  # without a terminal above; the pause itself in the unit tests
 def test_ctrl_c_at_a_terminal_pauses_and_the_same_process_goes_on(small: SmallCell, tmp_path: Path) -> None:
     cell, plan = real_time_cell(small, tmp_path, 6.0, 0.05)
     ours, theirs = pty.openpty()

@@ -14,7 +14,7 @@ from tests.system.conftest import RESOLUTION_PX, Cli
 
 FILES = {
     *("cell.yaml", "truth.yaml", "plan_calibration.yaml", "plan_verification.yaml", "plan_workpiece.yaml"),
-    *("calibration", "verification", "workpiece", "calibration.yaml", "verification.json", "cloud.ply", "report.html", "run.rrd"),
+    *("calibration", "verification", "workpiece", "calibration.yaml", "verification.json", "cloud.ply", "report.html", "report.json", "run.rrd"),
 }
 
 

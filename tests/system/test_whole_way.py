@@ -103,7 +103,7 @@ def test_report_and_show_write_their_files(small: SmallCell, calibration: Path, 
     assert not re.search(r"""(?:src|href)\s*=\s*["']?https?:|url\(\s*["']?https?:|@import""", page)  # nothing is fetched
     assert cli("show", calibration, small.calibration_session, "-o", recording, "--json").told["out"] == str(recording)
     assert recording.stat().st_size > 1000
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "run.rrd"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json", "run.rrd"]
 
 
 def test_the_calibrated_spheres_lie_where_they_stand(small: SmallCell, calibration: Path) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibrate.camera_error import NoCameraError
+from calibrate.camera_misfit import misfit_of
 from calibrate.solve import CalibrationSettings, solve_observations
 from drivers.simulated.draws import Sizes
 from tests.support.honesty import honest_cell
@@ -25,7 +27,10 @@ def test_a_model_that_fits_is_left_alone_and_the_other_told() -> None:
     volume = volume_cell(SEED, sizes=BENT)
     shots = random_shots(volume, volume.spheres, N_SHOTS // len(volume.spheres), np.random.default_rng([SEED, 1]))
     with one_thread():
-        field, none = (solve_observations(shots, volume.cell, volume.model, CalibrationSettings(name))[0].misfit for name in ("field", "none"))
+        solved = [solve_observations(shots, volume.cell, volume.model, CalibrationSettings(name))[0] for name in ("field", "none")]
+        field, none = solved[0].misfit, solved[1].misfit
+        others = [NoCameraError(), solved[0].solution.problem.camera_error]
+        assert misfit_of(solved[0].solution, others) is None
     assert field is None
     assert none is not None
     assert none.better_rms_mm < 0.95 * none.rms_mm
