@@ -1,4 +1,4 @@
-"""Writes a `Scene` as a Rerun recording (.rrd) with its layout. The only module that imports rerun.
+"""Writes a `Scene` as a Rerun recording (.rrd) with its layout. Only the viewer modules import rerun.
 
 A debug view, never the record of truth: Rerun promises to open only files of the version before. Lengths are logged in
 metres, where the viewer's eye and grid are sensible, and named in mm in the texts.
@@ -6,18 +6,16 @@ metres, where the viewer's eye and grid are sensible, and named in mm in the tex
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import FileError
 from drivers.kinematics.mdh import Capsule
 from measure.scene import Scene, SphereCloud, SphereMark, Step
+from measure.viewer_file import recording_file
 from measure.viewer_surroundings import log_surroundings
 
 if TYPE_CHECKING:
@@ -43,22 +41,12 @@ def write_recording(path: str | Path, scene: Scene) -> Path:
     Raises:
         FileError: the folder is missing or not writable.
     """
-    target = Path(path)
-    temporary = _temporary_beside(target)
-    try:
-        stream = _stream_to(temporary, scene)
+    with recording_file(path, layout=_layout(scene)) as stream:
         _log_static(stream, scene)
         for number, step in enumerate(scene.steps):
             stream.set_time(TIMELINE, sequence=number)
             _log_step(stream, scene, step)
-        stream.flush()
-        stream.disconnect()
-        os.replace(temporary, target)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise
-    return target
+    return Path(path)
 
 
 class LiveRecording:
@@ -80,23 +68,6 @@ class LiveRecording:
             _log_step(self._stream, self._scene, step)
         else:
             _log_robot(self._stream, self._scene, step)
-
-
-def _stream_to(path: Path, scene: Scene) -> rr.RecordingStream:
-    import rerun as rr
-
-    stream = rr.RecordingStream("spherecal")
-    try:
-        stream.save(path, default_blueprint=_layout(scene))
-    except (OSError, RuntimeError) as error:
-        raise FileError(f"cannot be written ({error})", file=path, remedy="Check that the folder is writable and has room.") from error
-    return stream
-
-
-def _temporary_beside(target: Path) -> Path:
-    if not target.parent.is_dir():
-        raise FileError("the folder does not exist", file=target, remedy="Make the folder first.")
-    return target.with_name(f".{target.name}.{os.getpid()}.tmp")
 
 
 def _log_static(stream: rr.RecordingStream, scene: Scene) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FileError
+from measure.viewer_file import recording_file
 
 if TYPE_CHECKING:
     from measure.fuse import FusedCloud
@@ -32,12 +31,9 @@ def write_cloud_recording(path: str | Path, cloud: FusedCloud, *, title: str) ->
     target = Path(path)
     if not target.parent.is_dir():
         raise FileError("no such folder", file=target.parent, remedy="Make it first.")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     shown = slice(None, None, max(1, -(-len(cloud.count) // _MOST_POINTS)))
     points = (cloud.points_mm[shown] * _METRES_PER_MM).astype(np.float32)
-    try:
-        stream = rr.RecordingStream("spherecal")
-        stream.save(temporary)
+    with recording_file(target) as stream:
         stream.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for name, values in (("uncertainty", cloud.uncertainty_mm), ("spread", cloud.spread_mm)):
             if np.isfinite(values).any():
@@ -47,15 +43,6 @@ def write_cloud_recording(path: str | Path, cloud: FusedCloud, *, title: str) ->
                 stream.log(f"legend/{name}", rr.TextDocument(f"{name}: blue {low:.4f} mm to yellow {high:.4f} mm"), static=True)
         text = f"{title}\n\n{len(cloud.count)} points, voxels of {cloud.voxel_mm:g} mm, drawn in metres"
         stream.log("legend/title", rr.TextDocument(text), static=True)
-        stream.flush()
-        stream.disconnect()
-        os.replace(temporary, target)
-    except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
-        if isinstance(error, OSError):
-            raise FileError(f"cannot be written ({error.strerror or error})", file=target, remedy="Check that the folder is writable.") from error
-        raise
     return target
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.errors import FileError
+from measure.viewer_file import recording_file
 
 if TYPE_CHECKING:
     from measure.history.displacement import DisplacementField
@@ -28,15 +26,10 @@ def write_difference(path: Path, field: DisplacementField) -> float:
     """
     import rerun as rr
 
-    if not path.absolute().parent.is_dir():
-        raise FileError("the folder does not exist", file=path, remedy="Make the folder first.")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     longest = max(float(field.size_mm.max()), 1e-6)
     factor = _LONGEST_OF_BOX * float(np.ptp(field.box_in_base_mm, axis=0).max()) / longest
     sure = field.size_mm > field.expanded_uncertainty_mm
-    try:
-        stream = rr.RecordingStream("spherecal")
-        stream.save(temporary)
+    with recording_file(path) as stream:
         stream.log("base", rr.ViewCoordinates.RIGHT_HAND_Z_UP, rr.TransformAxes3D(0.15), static=True)
         middle, half = field.box_in_base_mm.mean(axis=0), np.ptp(field.box_in_base_mm, axis=0) / 2
         stream.log("base/region", rr.Boxes3D(centers=[middle * _MM], half_sizes=[half * _MM], labels=[field.region]), static=True)
@@ -51,11 +44,4 @@ def write_difference(path: Path, field: DisplacementField) -> float:
             stream.log(f"base/{name.replace(' ', '_')}", arrows, static=True)
         text = f"Arrows are {factor:.0f} times as long as the displacement; orange ones are larger than their U (k = 2), grey ones are not."
         stream.log("text", rr.TextDocument(f"{field.first[:12]} to {field.second[:12]}\n\n{text}"), static=True)
-        stream.flush()
-        stream.disconnect()
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise
     return factor

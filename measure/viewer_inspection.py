@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.errors import FileError
 from measure.inspecting.picture import colour_scale_mm, colours_of
 from measure.inspecting.result import Inspection
+from measure.viewer_file import recording_file
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -28,23 +26,8 @@ def write_inspection(path: Path, inspection: Inspection) -> Path:
     Raises:
         FileError: it cannot be written.
     """
-    import rerun as rr
-
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    stream = rr.RecordingStream("spherecal_inspection")
-    try:
-        try:
-            stream.save(temporary, default_blueprint=_layout())
-        except (OSError, RuntimeError) as error:
-            raise FileError(f"cannot be written ({error})", file=path, remedy="Check that the folder is writable and has room.") from error
+    with recording_file(path, name="spherecal_inspection", layout=_layout()) as stream:
         _log(stream, inspection)
-        stream.flush()
-        stream.disconnect()
-        os.replace(temporary, path)
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)
-        raise
     return path
 
 
