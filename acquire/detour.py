@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -153,8 +152,3 @@ class _Tree:
             way.append(self.points[leaf])
             leaf = self._before[leaf]
         return way[::-1]
-
-
-def way_is_clear(check: CollisionCheck, points: Sequence[FloatArray]) -> bool:
-    """Whether every straight piece between neighbouring points (n,) is."""
-    return all(check.trouble(first, second) is None for first, second in pairwise(points))

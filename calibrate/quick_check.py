@@ -8,7 +8,7 @@ motion of the residuals per unknown, and the noise of points and poses that the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,9 +153,3 @@ def null_covariance_mm2(
     for i in range(m):
         covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += points_mm2[i]
     return np.asarray((covariance + covariance.T) / 2)
-
-
-def sphere_names_of(calibration: Calibration, problem: Problem) -> Mapping[int, str]:
-    """Names of the spheres that some shots look at, by index."""
-    names = tuple(calibration.sphere_centres_in_base_mm)
-    return {int(i): names[int(i)] for i in np.unique(problem.sphere)}

@@ -281,7 +281,8 @@ def _solve_and_reject(solver: _Solver, everything: Assembled, start: State, keep
     for _ in range(_REJECT_ROUNDS):
         part = everything.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = unexplained(part.problem, solution)[:2]
+        found = unexplained(part.problem, solution)
+        far, miss_mm = found.far, found.miss_mm
         external, spoiled = without_spoiled(solution)
         if not far.any() and not spoiled:
             break
@@ -299,7 +300,8 @@ def _solved_on_some_points(
     for _ in range(_REJECT_ROUNDS):
         part = thin.subset(keep)
         solution = solver.solve(part.problem, without_pose_noise(start, part.problem.n_scans), _FIRST_NOISE)
-        far, miss_mm = unexplained(part.problem, solution)[:2]
+        found = unexplained(part.problem, solution)
+        far, miss_mm = found.far, found.miss_mm
         if not far.any():
             break
         rejected += tuple(_too_far(part.shots[i], miss_mm[i]) for i in np.flatnonzero(far))

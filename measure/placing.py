@@ -19,6 +19,7 @@ from drivers.files.session import Session, Shot
 from drivers.kinematics import mdh
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
+from measure.proof.reach import KnowsItsReach
 
 
 class MeasuringSystem(Protocol):
@@ -65,7 +66,7 @@ class TrainingShot(Protocol):
         ...
 
 
-class JudgedSystem(MeasuringSystem, Protocol):
+class JudgedSystem(MeasuringSystem, KnowsItsReach, Protocol):
     """What verification needs besides."""
 
     @property
@@ -86,21 +87,6 @@ class JudgedSystem(MeasuringSystem, Protocol):
     @property
     def shots(self) -> Sequence[TrainingShot]:
         """The shots it was made from."""
-        ...
-
-    @property
-    def camera_seen_volume_mm(self) -> FloatArray:
-        """(2, 3) corners of the part of the camera frame in which it saw points."""
-        ...
-
-    @property
-    def seen_joints_rad(self) -> FloatArray | None:
-        """(2, n) least and greatest axis angles that it was made with."""
-        ...
-
-    @property
-    def sphere_centres_in_base_mm(self) -> Mapping[str, FloatArray]:
-        """{name: (3,)} where its spheres stood."""
         ...
 
     @property

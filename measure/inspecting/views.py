@@ -2,70 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from calibrate.normal import NoiseModel
 from drivers.errors import DataError
 from drivers.files.session import Session, read_scan
 from drivers.kinematics import se3
-from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.fitting import Response
 from measure.inspecting.uncertainty import SeenField
 from measure.placing import check_fits
 from measure.stitch import scans_once
+from measure.stitching.scan import KnowsItsErrors
 
 _POINTS_PER_VIEW = 6_000
-
-
-class KnowsItsErrors(Protocol):
-    """What this needs of a calibration; `calibrate.Calibration` is one."""
-
-    @property
-    def id(self) -> str:
-        """Digest that results carry."""
-        ...
-
-    @property
-    def identity(self) -> Mapping[str, object]:
-        """Serial numbers and the like of what was calibrated."""
-        ...
-
-    @property
-    def model(self) -> RobotModel | None:
-        """Nominal robot; None for a pose-only calibration."""
-        ...
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(P, P): the p parameters of `point_jacobian` first."""
-        ...
-
-    @property
-    def noise(self) -> NoiseModel:
-        """Noise of poses."""
-        ...
-
-    def base_from_flange(self, joints_rad: ArrayLike) -> FloatArray:
-        """Corrected robot (4, 4)."""
-        ...
-
-    def points_in_base_mm(
-        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
-    ) -> FloatArray:
-        """Calibrated points (n, 3)."""
-        ...
-
-    def point_jacobian(
-        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
-    ) -> FloatArray:
-        """(n, 3, p) motion of calibrated points per parameter."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

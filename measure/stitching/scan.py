@@ -13,6 +13,7 @@ from drivers.errors import DataError
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, Shot
 from drivers.kinematics.se3 import FloatArray
+from measure.length_uncertainty import KnowsItsCovariance
 from measure.placing import MeasuringSystem, points_of_shot_in_base_mm
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ _SMALLEST_SCAN_MM = 20.0
 _LARGEST_SCAN_MM = 20_000.0
 
 
-class StitchingSystem(MeasuringSystem, Protocol):
+class KnowsItsErrors(MeasuringSystem, KnowsItsCovariance, Protocol):
     """A measuring system that knows its uncertainty; `calibrate.Calibration` is one."""
 
     @property
@@ -35,24 +36,17 @@ class StitchingSystem(MeasuringSystem, Protocol):
         """What was found of noise."""
         ...
 
-    @property
-    def covariance(self) -> FloatArray:
-        """(P, P): the p parameters of `point_jacobian` first."""
-        ...
-
-    @property
-    def flange_from_camera(self) -> FloatArray:
-        """(4, 4)."""
-        ...
-
     def base_from_flange(self, joints_rad: ArrayLike) -> FloatArray:
         """Corrected robot (4, 4)."""
         ...
 
-    def point_jacobian(
-        self, points_in_camera_mm: ArrayLike, *, joints_rad: ArrayLike | None = None, base_from_flange: ArrayLike | None = None
-    ) -> FloatArray:
-        """(n, 3, p) motion of calibrated points per parameter."""
+
+class StitchingSystem(KnowsItsErrors, Protocol):
+    """What stitching needs besides."""
+
+    @property
+    def flange_from_camera(self) -> FloatArray:
+        """(4, 4)."""
         ...
 
 
