@@ -7,13 +7,15 @@ has gone, RobotTimeout when it takes no more bytes. Neither ever opens again by 
 
 from __future__ import annotations
 
+import queue
 import select
 import socket
+import threading
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from drivers.errors import LinkLost, RobotNotReached, RobotTimeout
+from drivers.errors import LinkLost, RobotError, RobotNotReached, RobotTimeout
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -21,6 +23,31 @@ if TYPE_CHECKING:
 _CHUNK = 4096
 _WIRE = "Is it switched on, is the cable in, and is the address right?"
 _PROGRAM = "Look at the controller: did its program stop or restart? Then continue with --resume."
+
+
+def addresses_of(host: str, timeout_s: float, family: socket.AddressFamily = socket.AF_UNSPEC) -> list[str]:
+    """The numeric addresses of a name, in the system's order; its resolver knows no deadline, so it runs in a thread of its own.
+
+    Raises:
+        RobotNotReached: there is none, or the name server is silent.
+    """
+    found: queue.SimpleQueue[list[str] | OSError] = queue.SimpleQueue()
+
+    def look_up() -> None:
+        try:
+            known = socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)
+            found.put(list(dict.fromkeys(str(address[0]) for *_, address in known)))
+        except (OSError, UnicodeError) as error:
+            found.put(error if isinstance(error, OSError) else OSError(str(error)))
+
+    threading.Thread(target=look_up, name="look-up", daemon=True).start()
+    try:
+        result = found.get(timeout=max(timeout_s, 0.0))
+    except queue.Empty:
+        result = OSError("the name server does not answer")
+    if isinstance(result, OSError):
+        raise RobotNotReached(f"{host!r} has no address: {result}", where="robot.host", remedy="Write the robot's IP address.") from result
+    return result
 
 
 class Link(Protocol):
@@ -62,17 +89,29 @@ class TcpLink:
         return f"{self.host}:{self.port}"
 
     def open(self, timeout_s: float) -> None:
-        """Connect.
+        """Connect; the addresses of a name share the time.
 
         Raises:
             RobotTimeout: nobody answers in time, as from a black hole.
             RobotNotReached: refused, or no such host.
         """
         self.close()
+        end_s = time.monotonic() + timeout_s
+        addresses = addresses_of(self.host, timeout_s)
+        for i, address in enumerate(addresses, start=1):
+            try:
+                self._socket = self._connected(address, (end_s - time.monotonic()) / (len(addresses) + 1 - i))
+            except RobotError:
+                if i == len(addresses):
+                    raise
+            else:
+                return
+
+    def _connected(self, address: str, seconds: float) -> socket.socket:
         try:
-            connection = socket.create_connection((self.host, self.port), timeout=timeout_s)
+            connection = socket.create_connection((address, self.port), timeout=max(seconds, 0.001))
         except TimeoutError as error:
-            raise RobotTimeout(f"nothing answers within {timeout_s:.1f} s", where=self.name, remedy=_WIRE) from error
+            raise RobotTimeout(f"nothing answers within {seconds:.1f} s", where=self.name, remedy=_WIRE) from error
         except ConnectionRefusedError as error:
             remedy = "Is the program running on the controller, and does it listen on this port?"
             raise RobotNotReached("the connection was refused", where=self.name, remedy=remedy) from error
@@ -81,7 +120,7 @@ class TcpLink:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         connection.setblocking(False)
-        self._socket = connection
+        return connection
 
     def write(self, data: bytes, timeout_s: float) -> None:
         """Send all of it.

@@ -93,7 +93,7 @@ class UrRobot:
         try:
             self._ask("connect", deadline)
             self.read_state()
-        except RobotError:
+        except BaseException:  # Ctrl-C among them
             self.close()
             raise
         return RobotInfo("ur_rtde", who.model or None, who.serial or None, f"PolyScope {version}", self._notes())

@@ -265,9 +265,11 @@ def serve(robot: Robot, requests: int, replies: int) -> None:
 
 
 def answer(robot: Robot, line: bytes) -> dict[str, object]:
-    """The reply to one request."""
+    """The reply to one request, with its number: a parent that was interrupted while it waited finds old replies before its own."""
+    number: object = None
     try:
         request = json.loads(line)
+        number = request.pop("number", None)
         actions: dict[str, Callable[..., dict[str, object]]] = {
             "connect": robot.connect,
             "control": robot.control,
@@ -276,11 +278,11 @@ def answer(robot: Robot, line: bytes) -> dict[str, object]:
             "stop": robot.stop,
             "freedrive": robot.freedrive,
         }
-        return {"ok": True, **actions[request.pop("do")](**request)}
+        return {"number": number, "ok": True, **actions[request.pop("do")](**request)}
     except Failure as failure:
-        return {"ok": False, "kind": failure.kind, "text": str(failure)}
+        return {"number": number, "ok": False, "kind": failure.kind, "text": str(failure)}
     except Exception as error:  # whatever the client throws has to reach the parent
-        return {"ok": False, "kind": "exception", "text": f"{type(error).__name__}: {error}"}
+        return {"number": number, "ok": False, "kind": "exception", "text": f"{type(error).__name__}: {error}"}
 
 
 def main() -> None:

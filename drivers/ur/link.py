@@ -43,6 +43,7 @@ class Child:
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
         self._buffer = b""
+        self._number = 0
         self._said: deque[str] = deque(maxlen=_LAST_WORDS)
         self._listener = threading.Thread(target=self._listen, name="ur_rtde's words", daemon=True)
         self._listener.start()
@@ -65,11 +66,14 @@ class Child:
             LinkLost: the child has died, as ur_rtde does when its link breaks at a bad moment.
         """
         pipe = self._process.stdin
+        self._number += 1
         try:
             if pipe is None or not self.alive:
                 raise BrokenPipeError
-            pipe.write(json.dumps({"do": what, **arguments}).encode() + b"\n")
-            return self._reply(what, deadline)
+            pipe.write(json.dumps({"do": what, "number": self._number, **arguments}).encode() + b"\n")
+            while (reply := self._reply(what, deadline)).get("number") != self._number:
+                pass  # of a request whose wait was interrupted (Ctrl-C)
+            return reply
         except BrokenPipeError as error:
             self.kill()
             raise LinkLost(f"the link to the controller broke ({self.last_words or 'no reason given'})", remedy=_REMEDY) from error
@@ -103,7 +107,10 @@ class Child:
                 raise BrokenPipeError
             self._buffer += data
         line, _, self._buffer = self._buffer.partition(b"\n")
-        reply: dict[str, Any] = json.loads(line)
+        try:
+            reply: dict[str, Any] = json.loads(line)
+        except ValueError:
+            return {}  # the rest of a reply whose beginning was read when Ctrl-C came
         return reply
 
     def _listen(self) -> None:

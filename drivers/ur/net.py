@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import queue
 import socket
-import threading
 import time
 from dataclasses import dataclass
 
 from drivers.errors import RobotNotReached, RobotTimeout
+from drivers.transport import addresses_of
 
 RTDE_PORT, DASHBOARD_PORT, PRIMARY_PORT = 30004, 29999, 30001
 _CHUNK = 4096
@@ -36,27 +35,12 @@ class Deadline:
 
 
 def address_of(host: str, deadline: Deadline) -> str:
-    """The IPv4 address of a name; the resolver of the system knows no deadline, so it runs in a thread of its own.
+    """The IPv4 address of a name; ur_rtde knows no other.
 
     Raises:
         RobotNotReached: there is none, or the name server is silent.
     """
-    found: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
-
-    def look_up() -> None:
-        try:
-            found.put(str(socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)[0][4][0]))
-        except (OSError, UnicodeError) as error:
-            found.put(error if isinstance(error, OSError) else OSError(str(error)))
-
-    threading.Thread(target=look_up, name="look-up", daemon=True).start()
-    try:
-        result = found.get(timeout=deadline.left_s)
-    except queue.Empty:
-        result = OSError("the name server does not answer")
-    if isinstance(result, OSError):
-        raise RobotNotReached(f"{host!r} has no address: {result}", where="robot.host", remedy="Write the robot's IP address.") from result
-    return result
+    return addresses_of(host, deadline.left_s, socket.AF_INET)[0]
 
 
 def connect(host: str, port: int, deadline: Deadline) -> socket.socket:

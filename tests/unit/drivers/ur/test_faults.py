@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -147,6 +148,23 @@ def test_a_command_whose_confirmation_is_lost_is_not_sent_again(controller: Fake
     time.sleep(0.3)
     assert controller.n_motions() == count + 1
     assert stands(controller)
+
+
+def test_ctrl_c_while_a_reading_is_waited_for_stops_the_robot(controller: FakeUr, robot: UrRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its reply comes later; it must not be taken for that of the stop, nor the stop's for a reading."""
+    under_way(robot)
+
+    def interrupted(*_: object) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("drivers.ur.link.select", SimpleNamespace(select=interrupted))
+    with pytest.raises(KeyboardInterrupt):
+        robot.read_state()
+    robot.stop()
+    assert stands(controller)
+    assert not robot.read_state().moving
+    list(move(robot, HOME, FAST))
 
 
 def test_a_cut_commanding_link_stays_cut(controller: FakeUr, robot: UrRobot) -> None:
