@@ -140,6 +140,8 @@ class Calibration:
     """Where in `camera_seen_volume_mm` points were seen; None in files of older versions."""
     error_budget: ErrorBudget | None = None
     """What a measured point is uncertain by, and why; None where no sphere was seen, and in files of older versions."""
+    _worked_out: dict[str, FloatArray] = field(default_factory=dict, init=False, repr=False)
+    """What hangs on nothing but the above, worked out once: scans of a part ask for it again and again."""
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -240,7 +242,7 @@ class Calibration:
             frames = self._chain(self.model, q)
             moved = link_columns(self.link_twists, frames, in_solver_base)
             rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
-            of_base = rigid @ datum_jacobian(self.datum, self.model, self.link_twists, self.terms, self.terms_rad)
+            of_base = rigid @ self._base_motion()
             blocks.append(moved + of_base[..., : self.link_twists.size])
         blocks.append(twist_columns(flange, in_solver_base))
         basis = self.camera_error.basis(points)
@@ -249,6 +251,12 @@ class Calibration:
             yielded = term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base)
             blocks.append(yielded + of_base[..., self.link_twists.size :])
         return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
+
+    def _base_motion(self) -> FloatArray:
+        """(6, p) how the stated base follows link twists and terms; two threads may work it out at once, to the same end."""
+        if "base_motion" not in self._worked_out:
+            self._worked_out["base_motion"] = datum_jacobian(self.datum, self.model, self.link_twists, self.terms, self.terms_rad)
+        return self._worked_out["base_motion"]
 
     def to_json_dict(self) -> dict[str, object]:
         """What `spherecal calibrate --json` prints."""

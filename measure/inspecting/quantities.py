@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +48,16 @@ class Quantity:
         return self.scale * (float(np.linalg.norm(found)) if self.is_length else float(found[0]))
 
 
+class Change(NamedTuple):
+    """A small step of one parameter."""
+
+    column: int
+    sign: int
+
+
+AS_FITTED = Change(-1, 0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
     """A figure with its standard uncertainty: half of an interval that holds 95 %."""
@@ -66,6 +77,8 @@ class Model:
     has_pose: bool = False
     """Whether six parameters of the alignment's own follow those of the fits."""
     _start: dict[str, int] = field(default_factory=dict)
+    _alignments: dict[Change, FloatArray] = field(default_factory=dict)
+    _aligned: dict[tuple[str, Change], Element] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         at = 0
@@ -79,16 +92,9 @@ class Model:
         pose = [np.zeros(6)] if self.has_pose else []
         return np.concatenate([*(fit.params for fit in self.fits.values()), *pose]) if self.fits or pose else np.zeros(0)
 
-    def elements(self, params: FloatArray, names: Sequence[str]) -> dict[str, Element]:
-        """Features in the aligned frame of the part."""
-        wanted = dict.fromkeys([*names, *self.datums])
-        found = {name: self._element(name, params) for name in wanted}
-        aligned = np.eye(4)
-        if self.datums:
-            aligned = datum_alignment(self.datums, found, self.nominal(self.datums))
-        elif self.has_pose:
-            aligned = se3.exp(params[-6:])
-        return {name: element.moved(aligned) for name, element in found.items() if name in names}
+    def elements(self, names: Sequence[str], change: Change = AS_FITTED) -> dict[str, Element]:
+        """Features in the aligned frame of the part, with one parameter changed. Each is worked out once for all figures."""
+        return {name: self._aligned_element(name, change) for name in names}
 
     def nominal(self, names: Sequence[str]) -> dict[str, Element]:
         """Features as drawn."""
@@ -96,17 +102,12 @@ class Model:
 
     def alignment(self) -> FloatArray:
         """(4, 4) what the datums still move the part by."""
-        if not self.datums:
-            return np.eye(4)
-        found = {name: self._element(name, self.params) for name in self.datums}
-        return datum_alignment(self.datums, found, self.nominal(self.datums))
+        return self._alignment(AS_FITTED) if self.datums else np.eye(4)
 
     def measure(self, quantity: Quantity, covariance: JointCovariance) -> Measured:
         """A figure and how well it is known."""
-        params = self.params
-        gradient = self._gradient(quantity, params)
-        known = covariance.of(gradient)
-        value = quantity.value(self.elements(params, quantity.features))
+        known = covariance.of(self._gradient(quantity))
+        value = quantity.value(self.elements(quantity.features))
         if not quantity.is_length:
             return Measured(value, quantity.scale * float(np.sqrt(max(known[0, 0], 0.0))))
         # at a length of nearly nothing no direction is told, so the worst one counts
@@ -114,26 +115,54 @@ class Model:
         dimensions = min(3, max(1, int((sizes > 0.01 * sizes[-1]).sum())))
         return Measured(value, quantity.scale * _COVERAGE[dimensions] * float(np.sqrt(sizes[-1])))
 
-    def _gradient(self, quantity: Quantity, params: FloatArray) -> FloatArray:
+    def _gradient(self, quantity: Quantity) -> FloatArray:
         """(m, P)."""
+        n_params = len(self.params)
         columns = [i for name in dict.fromkeys([*quantity.features, *self.datums]) for i in self._columns(name)]
-        columns += list(range(len(params) - 6, len(params))) if self.has_pose else []
+        columns += list(range(n_params - 6, n_params)) if self.has_pose else []
         rows = []
         for column in columns:
-            step = np.zeros(len(params))
-            step[column] = _STEP
-            after, before = (quantity.function(self.elements(params + sign * step, quantity.features)) for sign in (1, -1))
+            after, before = (quantity.function(self.elements(quantity.features, Change(column, sign))) for sign in (1, -1))
             rows.append((after - before) / (2 * _STEP))
-        result = np.zeros((len(rows[0]), len(params)))
+        result = np.zeros((len(rows[0]), n_params))
         result[:, columns] = np.array(rows).T
         return result
 
     def _columns(self, name: str) -> range:
         return range(self._start[name], self._start[name] + len(self.fits[name].params))
 
-    def _element(self, name: str, params: FloatArray) -> Element:
+    def _aligned_element(self, name: str, change: Change) -> Element:
+        if change.column not in self._columns(name) and not self._moves_all(change):
+            change = AS_FITTED
+        if (name, change) not in self._aligned:
+            aligned = self._alignment(change if self._moves_all(change) else AS_FITTED)
+            self._aligned[name, change] = self._element(name, change).moved(aligned)
+        return self._aligned[name, change]
+
+    def _moves_all(self, change: Change) -> bool:
+        """Whether the alignment hangs on the parameter."""
+        if self.has_pose and not self.datums:
+            return change.column >= len(self.params) - 6
+        return any(change.column in self._columns(name) for name in self.datums)
+
+    def _alignment(self, change: Change) -> FloatArray:
+        if change not in self._alignments:
+            if self.datums:
+                found = {name: self._element(name, change) for name in self.datums}
+                self._alignments[change] = datum_alignment(self.datums, found, self.nominal(self.datums))
+            else:
+                self._alignments[change] = se3.exp(self._changed(change)[-6:]) if self.has_pose else np.eye(4)
+        return self._alignments[change]
+
+    def _element(self, name: str, change: Change) -> Element:
         columns = self._columns(name)
-        return element_of(self.features[name], self.fits[name].shape, params[columns.start : columns.stop])
+        return element_of(self.features[name], self.fits[name].shape, self._changed(change)[columns.start : columns.stop])
+
+    def _changed(self, change: Change) -> FloatArray:
+        params = self.params
+        if change.sign:
+            params[change.column] += change.sign * _STEP
+        return params
 
 
 def own_quantities(name: str, element: Element) -> list[Quantity]:

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from acquire.cell import Cell
 from acquire.poses import PoseLaw, workpiece_poses
+from acquire.session import SessionWriter
 from acquire.visibility import camera_view
 from calibrate.result import Calibration
+from drivers.files.session import Session, read_session
 from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
@@ -71,6 +74,15 @@ class MeasuredPart:
     scans: tuple[FloatArray, ...]
     """(n, 3) finite points in the camera."""
     joints_rad: FloatArray
+    grids_mm: tuple[NDArray[np.float32], ...] = ()
+    """(h, w, 3) the scans as the camera gave them, flying pixels and all."""
+
+    def session(self, folder: Path, cell: Cell) -> Session:
+        """The scans on disk, as a capture leaves them."""
+        with SessionWriter.create(folder, purpose="workpiece", cell=cell) as writer:
+            for joints, grid in zip(self.joints_rad, self.grids_mm, strict=True):
+                writer.append(joints_rad=joints, xyz_mm=grid)
+        return read_session(folder)
 
     @property
     def views(self) -> list[View]:
@@ -176,13 +188,14 @@ def measure_part(
     joints = _poses(cell, model, base_from_part, n_views, rng)
     eye = SimulatedCamera(cell)
     eye.open()
-    scans = []
+    scans, grids = [], []
     for q in joints:
         cell.start_motion(q, speed_rad_s=1.0)
         cell.advance(60.0)
-        grid = eye.capture(timeout_s=10.0).xyz_mm.astype(np.float64)
+        grids.append(eye.capture(timeout_s=10.0).xyz_mm)
+        grid = grids[-1].astype(np.float64)
         scans.append(grid[supported(grid)])
-    return MeasuredPart(part, base_from_part, tuple(scans), joints)
+    return MeasuredPart(part, base_from_part, tuple(scans), joints, tuple(grids))
 
 
 def _poses(cell: SimulatedCell, model: RobotModel, base_from_part: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:

@@ -54,7 +54,8 @@ def test_what_is_saved_is_loaded(pose_only: bool, calibration: Calibration, pose
     c = pose_only_calibration if pose_only else calibration
     c.save(tmp_path / "c.yaml")
     again = Calibration.load(tmp_path / "c.yaml")
-    different = [f.name for f in fields(c) if not same(getattr(c, f.name), getattr(again, f.name))]
+    # what is worked out on the way belongs to no file
+    different = [f.name for f in fields(c) if f.init and not same(getattr(c, f.name), getattr(again, f.name))]
     assert not different
     assert again.id == c.id
     again.save(tmp_path / "d.yaml")
