@@ -9,8 +9,12 @@ from drivers.files.session import Session
 
 
 def inputs_of(cell: Cell, sessions: Sequence[Session]) -> dict[str, object]:
-    """Names and digests of the sessions, and the digest of their cell file."""
-    return {"sessions": [{"folder": s.folder.name, "digest": s.digest} for s in sessions], "cell_sha256": cell.sha256}
+    """Names and digests of the sessions, the digest of their cell file, and the drivers that robot and camera were used by."""
+    return {
+        "sessions": [{"folder": s.folder.name, "digest": s.digest} for s in sessions],
+        "cell_sha256": cell.sha256,
+        "drivers": {"robot": cell.robot.driver, "camera": cell.camera.driver},
+    }
 
 
 def identity_of(cell: Cell, sessions: Sequence[Session]) -> dict[str, object]:

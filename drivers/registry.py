@@ -39,8 +39,22 @@ _BUILT_IN: dict[str, dict[str, str]] = {
     },
 }
 
-NEVER_ON_HARDWARE = frozenset({"ur_rtde", "abb_socket", "folder", "genicam", "realsense", "mech_eye", "photoneo", "zivid"})
-"""Drivers without a signed hardware log in docs/; every report says so."""
+HARDWARE_LOGS: Mapping[str, str] = {}
+"""The signed hardware log of each driver that has one, a page under docs/. None has: see docs/add_a_robot.md."""
+
+_NO_HARDWARE = frozenset({"simulated", "recorded"})
+
+
+def untried_drivers(*drivers: str) -> tuple[str, ...]:
+    """Those of the drivers whose work on hardware nobody has signed for; simulations and replays need none."""
+    return tuple(sorted({name for name in drivers if name not in HARDWARE_LOGS and name not in _NO_HARDWARE}))
+
+
+def hardware_remark(driver: str) -> str:
+    """What every report says of an untried driver."""
+    if driver in _BUILT_IN[ROBOT_GROUP] or driver in _BUILT_IN[CAMERA_GROUP]:
+        return f"The driver {driver} has never run on hardware: no signed hardware log is in its documentation."
+    return f"The driver {driver} is none of spherecal's own: whether it has ever run on hardware is not known here."
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,8 +67,10 @@ def write_report(
     """
     names = {**folders_of(calibration.inputs), **(session_names or {})}
     more = (*beside_table(verification, others), *shots_table(calibration.shots, names))
-    write_text_atomic(Path(path).with_suffix(".json"), json_text(report_data(calibration, verification, others)) + "\n")
-    return write_page(path, facts_of(calibration, cell, session_names), verification, more=more, pdf=pdf)
+    facts = facts_of(calibration, cell, session_names)
+    data = {**report_data(calibration, verification, others), "remarks": list(remarks_of(facts, verification))}
+    write_text_atomic(Path(path).with_suffix(".json"), json_text(data) + "\n")
+    return write_page(path, facts, verification, more=more, pdf=pdf)
 
 
 def write_page(

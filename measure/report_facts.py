@@ -9,7 +9,7 @@ import numpy as np
 from acquire.cell import Cell
 from calibrate.result import Calibration, ShotResult
 from drivers.kinematics.se3 import FloatArray
-from drivers.registry import NEVER_ON_HARDWARE
+from drivers.registry import untried_drivers
 from measure.report_page import CalibrationFacts, ShotResidual
 
 _DATUM_TEXTS = {
@@ -57,7 +57,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         identifiability=calibration.identifiability,
         error_budget=calibration.error_budget,
         robot_alone=calibration.hand_eye != "calibrated",
-        untried_drivers=() if cell is None else tuple(sorted({cell.robot.driver, cell.camera.driver} & NEVER_ON_HARDWARE)),
+        untried_drivers=untried_drivers(*_drivers(calibration, cell)),
     )
 
 
@@ -80,9 +80,15 @@ def _residual_name(shots: Sequence[ShotResult]) -> str:
     return "distance from sphere centre, mm" if is_centre else "radial rms, mm"
 
 
+def _drivers(calibration: Calibration, cell: Cell | None) -> set[str]:
+    """Of robot and camera, as the calibration's file and the cell name them."""
+    named = calibration.inputs.get("drivers")
+    known = {str(name) for name in named.values()} if isinstance(named, Mapping) else set()
+    return known if cell is None else known | {cell.robot.driver, cell.camera.driver}
+
+
 def _is_simulated(calibration: Calibration, cell: Cell | None) -> bool:
-    drivers = () if cell is None else (cell.robot.driver, cell.camera.driver)
-    return "simulated" in {*drivers, *(str(value) for value in calibration.identity.values())}
+    return "simulated" in {*_drivers(calibration, cell), *(str(value) for value in calibration.identity.values())}
 
 
 def folders_of(inputs: Mapping[str, object]) -> dict[str, str]:

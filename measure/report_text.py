@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from acquire.cell import Limits
+from drivers.registry import hardware_remark
 from measure.decision import RULE
 from measure.proof.lengths import LengthResult
 from measure.report_page import CalibrationFacts, Row, Table
@@ -67,7 +68,7 @@ def remarks_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tu
     remarks = []
     if facts.simulated:
         remarks.append("Simulated cell: these figures come from a model of robot and camera, never from hardware.")
-    remarks += [f"The driver {name} has never run on hardware: no signed hardware log is in its documentation." for name in facts.untried_drivers]
+    remarks += [hardware_remark(name) for name in facts.untried_drivers]
     if verification is not None and not verification.held_out:
         remarks.append(f"{TRAINING_REMARK}. The figures flatter.")
     if verification is not None:

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from acquire.cell import cell_of_session
 from drivers.errors import DataError, SettingsError
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, Shot, read_scan
@@ -293,11 +294,13 @@ def scans_once(session: Session) -> tuple[Shot, ...]:
 
 def cloud_label(calibration: StitchingSystem, session: Session, settings: StitchSettings, n_scans: int, *further: str) -> CloudLabel:
     """What the file says of a cloud."""
+    cell = cell_of_session(session)
     comments = (
         "unit mm",
         "frame base",
         f"calibration {calibration.id}",
         f"session {session.digest}",
+        f"drivers {cell.robot.driver} {cell.camera.driver}",
         f"voxel_mm {settings.voxel_mm:g}",
         f"scans {n_scans}",
         "uncertainty is standard (k = 1), mm, along the normal",

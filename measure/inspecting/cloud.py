@@ -14,6 +14,7 @@ from drivers.errors import DataError, FileError
 from drivers.files.clouds import parse_cloud
 from drivers.files.ply import PointCloud, read_ply
 from drivers.kinematics.se3 import FloatArray
+from drivers.registry import hardware_remark, untried_drivers
 
 FEWEST_POINTS = 100
 _FARTHEST_MM = 1e6
@@ -61,7 +62,8 @@ def load_cloud(path: str | Path) -> MeasuredCloud:
     near = np.asarray(finite & (np.abs(np.where(finite[:, None], points, 0.0)) <= _FARTHEST_MM).all(axis=1))
     _require_some(len(points), int(finite.sum()), int(near.sum()), file)
     kept = points[near]
-    notes = _remarks(kept, int(finite.sum() - near.sum()))
+    untried = untried_drivers(*header.get("drivers", "").split())
+    notes = (*_remarks(kept, int(finite.sum() - near.sum())), *map(hardware_remark, untried))
     return MeasuredCloud(
         file=file,
         points_mm=kept,

@@ -84,6 +84,8 @@ class CameraCheck:
     judgements: tuple[Judgement, ...]
     verdict: Verdict
     reasons: tuple[str, ...]
+    drivers: tuple[str, ...] = ()
+    """Of the cameras."""
 
     def session_name(self, digest: str) -> str:
         """Folder name of a session."""
@@ -153,7 +155,8 @@ def camera_check(sessions: Sequence[Session], *, limits: tuple[float, float] | N
     given = next((cell.limits for cell in cells if cell.limits is not None), None)
     found = check_shots(shots, next(c.camera.working_range_mm for c in cells), _certificates(cells), limits=limits or _limits_of(given))
     names = tuple(SessionName(session.folder.name, session.digest) for session in sessions)
-    return replace(found, sessions=names, rejected=rejected)
+    drivers = tuple(sorted({cell.camera.driver for cell in cells}))
+    return replace(found, sessions=names, rejected=rejected, drivers=drivers)
 
 
 def check_shots(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drivers.files.disk import write_text_atomic
+from drivers.registry import hardware_remark, untried_drivers
 from measure.decision import RULE
 from measure.plots import AFTER_COLOUR, BAD_COLOUR, legend_above, svg_of
 from measure.proof.camera_check import CameraCheck
@@ -39,6 +40,7 @@ def render(check: CameraCheck, moment: datetime.datetime) -> str:
         tone=TONES[check.verdict],
         summary=summary(check),
         reasons=check.reasons,
+        remarks=[hardware_remark(name) for name in untried_drivers(*check.drivers)],
         pictures=(_courses_svg(check), _map_svg(check)),
         rows=[(check.session_name(p.session), p) for p in check.places],
         rejected=[(check.session_name(r.session), r.index, r.reason) for r in check.rejected],

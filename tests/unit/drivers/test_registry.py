@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from drivers import registry
 from drivers.errors import SettingsError
 from drivers.protocols import Camera3D, Devices, Robot
 from drivers.recorded import make_camera, make_robot
-from drivers.registry import CAMERA_GROUP, ROBOT_GROUP, DriverContext, driver_names, make_devices
+from drivers.registry import CAMERA_GROUP, HARDWARE_LOGS, ROBOT_GROUP, DriverContext, driver_names, hardware_remark, make_devices, untried_drivers
 from tests.support.sessions import write_session
+from tests.support.source import ROOT
 
 
 def _make(folder: Path, robot: str = "recorded", camera: str = "recorded") -> Devices:
@@ -58,6 +60,18 @@ def test_a_driver_that_cannot_be_loaded_is_told(value: str, tmp_path: Path, monk
     _third_party(monkeypatch, value)
     with pytest.raises(SettingsError, match="cannot be loaded"):
         _make(tmp_path, robot="mine")
+
+
+def test_a_driver_counts_as_run_on_hardware_only_with_a_signed_log() -> None:
+    """Every one that drives anything, until its page under docs/ bears a date, a name and a signature."""
+    built_in = {*registry._BUILT_IN[ROBOT_GROUP], *registry._BUILT_IN[CAMERA_GROUP]}
+    assert set(untried_drivers(*built_in)) == built_in - {"simulated", "recorded"} - set(HARDWARE_LOGS)
+    for driver, page in HARDWARE_LOGS.items():
+        assert driver in built_in
+        assert re.search(r"Signed: .+, \d{4}-\d{2}-\d{2}", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert "never run on hardware" in hardware_remark("abb_socket")
+    assert "none of spherecal's own" in hardware_remark("my_arm")
+    assert untried_drivers("simulated", "my_arm") == ("my_arm",)
 
 
 def test_robot_and_camera_of_a_cell_share_what_they_need(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import trimesh
 from drivers.errors import DataError, FileError
 from drivers.files.ply import write_ply
 from drivers.kinematics.se3 import FloatArray
+from drivers.registry import hardware_remark
 from drivers.simulated.workpiece_machined import MachinedPart
 from measure.inspecting.cloud import load_cloud
 from measure.inspecting.distance import NominalSurface
@@ -72,7 +73,8 @@ def test_nan_rows_and_far_points_are_dropped_and_what_the_file_states_is_read(tm
         "count": np.arange(600, dtype=np.uint32),
         "uncertainty": np.full(600, 0.03),
     }
-    write_ply(tmp_path / "cloud.ply", points, properties=columns, comments=["unit mm", "frame base", "calibration abc", "voxel_mm 0.5"])
+    comments = ["unit mm", "frame base", "calibration abc", "drivers ur_rtde simulated", "voxel_mm 0.5"]
+    write_ply(tmp_path / "cloud.ply", points, properties=columns, comments=comments)
     cloud = load_cloud(tmp_path / "cloud.ply")
     assert len(cloud.points_mm) == 399
     assert cloud.standard_uncertainty_mm == pytest.approx(0.03)
@@ -81,6 +83,7 @@ def test_nan_rows_and_far_points_are_dropped_and_what_the_file_states_is_read(tm
     assert cloud.normals is not None
     assert cloud.normals[:, 2].tolist() == [1.0] * 399
     assert "dropped" in cloud.notes[0]
+    assert cloud.notes[1:] == (hardware_remark("ur_rtde"),)
 
 
 @pytest.mark.parametrize(

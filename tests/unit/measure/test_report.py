@@ -135,6 +135,16 @@ def test_a_calibration_alone_is_never_called_conform(calibration: Calibration, v
     assert "No verification was given" in text
 
 
+def test_drivers_without_a_signed_hardware_log_are_remarked_without_any_cell(calibration: Calibration, tmp_path: Path) -> None:
+    """The calibration's own file names them, so a report of it alone says so too."""
+    of_abb = replace(without_pictures(calibration), inputs={**calibration.inputs, "drivers": {"robot": "abb_socket", "camera": "recorded"}})
+    page = write_report(tmp_path / "report.html", of_abb)
+    sentence = "The driver abb_socket has never run on hardware"
+    assert sentence in read(page)[0]
+    (remark,) = json.loads(page.with_suffix(".json").read_text())["remarks"]
+    assert remark.startswith(sentence)
+
+
 def test_simulated_cells_and_training_data_are_remarked(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
     assert remarks_of(facts_of(calibration), verification) == ()
     (untried,) = remarks_of(replace(facts_of(calibration), untried_drivers=("abb_socket",)), verification)

@@ -40,7 +40,7 @@ def test_the_stitched_points_lie_on_the_spheres(session: Session, tmp_path: Path
     assert np.abs(distances.min(axis=0) - 19.05).max() < 0.35
     assert (cloud.properties["spread"] <= 0.5 * np.sqrt(3)).all()
     assert progress == [(i, 6) for i in range(1, 7)]
-    assert {"unit mm", "frame base", f"calibration {SYSTEM.id}", f"session {session.digest}"} <= set(cloud.comments)
+    assert {"unit mm", "frame base", f"calibration {SYSTEM.id}", f"session {session.digest}", "drivers recorded recorded"} <= set(cloud.comments)
     assert result.to_json_dict()["n_points"] == result.n_points
     json.dumps(result.to_json_dict())
 
