@@ -46,7 +46,7 @@ from acquire.session import SessionWriter
 from acquire.way import way_of
 from drivers.errors import CameraError, CameraTimeout, MotionRefused, RobotError, RobotNotReached, SettingsError, SpherecalError
 from drivers.kinematics.mdh import RobotModel
-from drivers.protocols import Devices, Robot
+from drivers.protocols import Devices, stop_after
 
 __all__ = ["CaptureSettings", "RobotUnsettled", "planned_seconds", "run_capture", "settings_of"]
 
@@ -81,16 +81,8 @@ def run_capture(
     except _Unheeded as unheeded:
         raise unheeded.error from unheeded.error.__cause__
     except BaseException as error:
-        _stop(devices.robot, error)
+        stop_after(devices.robot, error)
         raise
-
-
-def _stop(robot: Robot, error: BaseException) -> None:
-    """Stop a robot after an error, which stays the one that is told."""
-    try:
-        robot.stop()
-    except SpherecalError as second:
-        error.add_note(f"and the robot could not be stopped: {second}")
 
 
 class _Interrupted(Exception):
@@ -245,7 +237,7 @@ class _Run:
 
     def _suspend(self, error: SpherecalError) -> Steps:
         """Stop the robot and ask."""
-        _stop(self._robot, error)
+        stop_after(self._robot, error)
         while True:
             command = yield from self._yield(Suspended(self._book.id_in_hand, cause_of(error), error))
             if command is None:

@@ -23,6 +23,8 @@ from typing import Literal, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import SpherecalError
+
 FloatArray = NDArray[np.float64]
 
 
@@ -247,11 +249,30 @@ class Camera3D(Protocol):
         ...
 
 
+def stop_after(robot: Robot, error: BaseException) -> SpherecalError | None:
+    """Stop a robot after an error, which stays the one that is told; its remedy says so where the stop fails, too.
+
+    Returns:
+        Why it could not be told to stop; None where it could.
+    """
+    try:
+        robot.stop()
+    except SpherecalError as second:
+        if isinstance(error, SpherecalError) and _NOT_STOPPED not in (error.remedy or ""):
+            error.remedy = f"{_NOT_STOPPED} ({second.message}): press the emergency stop if it moves. {error.remedy or ''}".strip()
+        return second
+    return None
+
+
+_NOT_STOPPED = "The robot could not be told to stop"
+
+
 @dataclass(frozen=True, slots=True)
 class Devices:
     """The robot and the camera of one cell, opened and closed together.
 
     The robot is stopped when the block ends by an exception: a program that lost its way must not leave a moving arm.
+    The exception goes on, and tells with it when the robot could not be stopped.
     """
 
     robot: Robot
@@ -278,8 +299,9 @@ class Devices:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Stop the robot on any exception, then close both."""
         try:
-            if kind is not None:
-                self.robot.stop()
+            second = None if error is None else stop_after(self.robot, error)
+            if second is not None and not isinstance(error, SpherecalError):
+                raise second  # says more than Ctrl-C or a bug does
         finally:
             try:
                 self.camera.close()

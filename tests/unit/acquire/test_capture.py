@@ -316,14 +316,25 @@ def test_a_safety_stop_ends_the_run(bench: Bench, safety: Safety, reads: int) ->
 
 
 def test_the_first_error_stays_when_the_robot_cannot_be_stopped(bench: Bench) -> None:
+    """Once in the run and once more where the devices are let go: the operator reads the cause and, once, that it may move."""
+
     def lost() -> None:
         raise RobotNotReached("the link is gone")
 
     bench.robot.stop = lost  # type: ignore[method-assign]
     bench.camera.faults = [CameraNotReached("unplugged")]
-    with pytest.raises(CameraNotReached) as caught:
+    with pytest.raises(CameraNotReached) as caught, bench.devices:
         bench.run(fake_plan(1))
-    assert any("link is gone" in note for note in caught.value.__notes__)
+    assert str(caught.value).count("could not be told to stop (the link is gone): press the emergency stop") == 1
+
+
+def test_ctrl_c_is_no_reason_to_hide_that_the_robot_may_move(bench: Bench) -> None:
+    def lost() -> None:
+        raise RobotNotReached("the link is gone")
+
+    bench.robot.stop = lost  # type: ignore[method-assign]
+    with pytest.raises(RobotNotReached, match="link is gone"), bench.devices:
+        raise KeyboardInterrupt
 
 
 def test_letting_go_of_the_run_stops_the_robot(bench: Bench) -> None:
