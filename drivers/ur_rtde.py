@@ -22,8 +22,8 @@ import numpy as np
 from drivers.errors import ChannelTaken, MotionRefused, RobotError, RobotNotReached, RobotTimeout, StaleReading
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
-from drivers.protocols import CONNECT_S, SILENCE_S, RobotInfo, RobotState
-from drivers.readings import checked_target
+from drivers.protocols import CONNECT_S, MAX_AGE_S, SILENCE_S, RobotInfo, RobotState
+from drivers.readings import check_age, checked_target
 from drivers.registry import DriverContext
 from drivers.ur import dashboard
 from drivers.ur.arm import Arm, read_arm
@@ -99,14 +99,18 @@ class UrRobot:
         return RobotInfo("ur_rtde", who.model or None, who.serial or None, f"PolyScope {version}", self._notes())
 
     def read_state(self) -> RobotState:
-        """A reading that came while it was waited for.
+        """A reading that came while it was waited for; one that a busy computer has let grow old on the way is asked for again.
 
         Raises:
             LinkLost: the link has gone, now or earlier.
             StaleReading: the controller is there and its readings stand still or come late.
             RobotTimeout: it says nothing any more.
         """
-        return self._state(self._raw())
+        end_s = time.monotonic() + SILENCE_S / 2
+        while (state := self._state(self._raw())).age_s > MAX_AGE_S:
+            if time.monotonic() > end_s:
+                check_age(state)
+        return state
 
     def start_move(self, joints_rad: FloatArray, *, speed_rad_s: float) -> None:
         """Start a motion; the fastest axis keeps `speed_rad_s`, the axes arrive together.
