@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -36,6 +37,10 @@ def run_jobs(
     cell: Annotated[Path | None, typer.Option("--cell", help="Cell file, for folders of scans and poses.")] = None,
     nominal: Annotated[Path | None, typer.Option("--nominal", help="Mesh of the part, mm: every cloud is inspected.")] = None,
     spec: Annotated[Path | None, typer.Option("--spec", help="inspection.yaml: features, alignment, tolerances.")] = None,
+    correlation: Annotated[
+        Path | None, typer.Option("--correlation", help="Offsets of `gauge correlation`: corrected values beside the raw.")
+    ] = None,
+    judge_corrected: Annotated[bool, typer.Option("--judge-corrected", help="Judge what the correlation names by the corrected value.")] = False,
     history: HistoryPlace = None,
     voxel: Annotated[float, typer.Option("--voxel", help="Edge of the voxels, mm.")] = 0.5,
     keep_edges: Annotated[bool, typer.Option("--keep-edges", help="Keep flying pixels.")] = False,
@@ -58,7 +63,8 @@ def run_jobs(
     with command(as_json, debug, quiet) as run:
         from measure.jobs.runner import RunSettings
 
-        recipe, files = _recipe(out, calibration, cell, nominal, spec, voxel, not keep_edges)
+        wanted = _Wanted(calibration, cell, nominal, spec, correlation, judge_corrected)
+        recipe, files = _recipe(out, wanted, voxel, not keep_edges)
         settings = RunSettings(
             once=once,
             finite=not parts.is_dir(),
@@ -124,14 +130,24 @@ def _history(option: str | None, calibration: Path) -> str | None:
     return place if place is None or is_url(place) else str(Path(place).absolute())
 
 
-def _recipe(
-    out: Path, calibration: Path, cell: Path | None, nominal: Path | None, spec: Path | None, voxel_mm: float, clean_edges: bool
-) -> tuple[Recipe, Files]:
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """Files as the command names them."""
+
+    calibration: Path
+    cell: Path | None
+    nominal: Path | None
+    spec: Path | None
+    correlation: Path | None
+    judge_corrected: bool
+
+
+def _recipe(out: Path, wanted: _Wanted, voxel_mm: float, clean_edges: bool) -> tuple[Recipe, Files]:
     """What is done with every part, its files copied beside the results.
 
     Raises:
         FileError: one of them is missing or broken, or the folder cannot be written.
-        SettingsError: the voxel size is no positive number, or a specification without a mesh.
+        SettingsError: the voxel size is no positive number, a specification without a mesh, or a correlation without one.
     """
     from calibrate.result import Calibration
     from drivers.errors import SettingsError
@@ -140,33 +156,41 @@ def _recipe(
 
     if not 0 < voxel_mm < float("inf"):
         raise SettingsError(f"voxel size {voxel_mm} mm is not a positive number", where="--voxel", remedy="Choose for example 0.5.")
-    if spec is not None and nominal is None:
+    if wanted.spec is not None and wanted.nominal is None:
         raise SettingsError("a specification without a mesh", where="--spec", remedy="Name the mesh with --nominal.")
-    loaded = Calibration.load(calibration)
-    _check_readable(cell, nominal, spec)
+    if wanted.correlation is not None and wanted.spec is None:
+        raise SettingsError("a correlation without tolerances", where="--correlation", remedy="Name what is judged with --spec.")
+    if wanted.judge_corrected and wanted.correlation is None:
+        raise SettingsError("--judge-corrected without --correlation", remedy="Name the correlation file.")
+    loaded = Calibration.load(wanted.calibration)
+    _check_readable(wanted)
     prepare(out)
-    calibration_copy, _ = keep_copy(out, calibration)
-    (cell_copy, cell_sha256), (mesh, mesh_sha256), (spec_copy, spec_sha256) = (
-        (None, None) if path is None else keep_copy(out, path) for path in (cell, nominal, spec)
+    calibration_copy, _ = keep_copy(out, wanted.calibration)
+    (cell_copy, cell_sha256), (mesh, mesh_sha256), (spec_copy, spec_sha256), (offsets, offsets_sha256) = (
+        (None, None) if path is None else keep_copy(out, path) for path in (wanted.cell, wanted.nominal, wanted.spec, wanted.correlation)
     )
-    recipe = Recipe(loaded.id, voxel_mm, clean_edges, cell_sha256, mesh_sha256, spec_sha256)
-    return recipe, Files(calibration_copy, cell_copy, mesh, spec_copy)
+    recipe = Recipe(loaded.id, voxel_mm, clean_edges, cell_sha256, mesh_sha256, spec_sha256, offsets_sha256, wanted.judge_corrected)
+    return recipe, Files(calibration_copy, cell_copy, mesh, spec_copy, offsets, wanted.judge_corrected)
 
 
-def _check_readable(cell: Path | None, nominal: Path | None, spec: Path | None) -> None:
+def _check_readable(wanted: _Wanted) -> None:
     """See that the recipe's files are whole before a thousand jobs find out; FileError where one is not."""
     from acquire.cell import load_cell
 
-    if cell is not None:
-        load_cell(cell)
-    if nominal is not None:
+    if wanted.cell is not None:
+        load_cell(wanted.cell)
+    if wanted.nominal is not None:
         from measure.inspecting.nominal import load_nominal
 
-        load_nominal(nominal)
-    if spec is not None:
+        load_nominal(wanted.nominal)
+    if wanted.spec is not None:
         from measure.inspecting.spec import load_spec
 
-        load_spec(spec)
+        load_spec(wanted.spec)
+    if wanted.correlation is not None:
+        from measure.gauge.correlation import load_correlation
+
+        load_correlation(wanted.correlation)
 
 
 def _lister(parts: Path) -> Callable[[], Iterable[Path]]:

@@ -164,9 +164,7 @@ class Stitcher:
         self.surfaces: list[ScanSurface] = []
         """What registration needs of each scan, where it was asked for."""
         unit = unit_variance_mm2(calibration.noise)
-        self.grid = VoxelGrid(
-            settings.voxel_mm, full=settings.full, unit_variance_mm2=unit, memory_mb=settings.memory_mb, spill_folder=spill_folder
-        )
+        self.grid = VoxelGrid(settings.voxel_mm, full=settings.full, unit_variance_mm2=unit, memory_mb=settings.memory_mb, spill_folder=spill_folder)
 
     def add(self, shot: Shot, cloud: PointCloud) -> ScanCounts:
         """Fuse one scan; from any thread, in any order.
@@ -182,9 +180,7 @@ class Stitcher:
         if shot.index in self._motions:
             # normals stay: they turn by less than a thousandth
             points = se3.apply(self._motions[shot.index], points.reshape(-1, 3)).reshape(points.shape)
-        added = self.grid.add(
-            points, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None
-        )
+        added = self.grid.add(points, weights=scan.weights, normals=scan.normals if full else None, variances=scan.variances if full else None)
         empty = () if scan.n_valid else (shot.index,)
         return ScanCounts(scan.n_valid, scan.n_edge, scan.n_grazing, scan.n_speck, added.n_outside, empty)
 
@@ -231,12 +227,12 @@ def stitch(
     marks = check_fits(calibration, session)
     shots = scans_once(session)
     counts = ScanCounts()
-    for done, added in enumerate(_fused_scans(stitcher, session, shots, chosen.n_threads), start=1):
+    for done, added in enumerate(fused_scans(stitcher.add, session, shots, chosen.n_threads), start=1):
         counts += added
         if on_progress is not None:
             on_progress(done, len(shots))
     n_points = stitcher.grid.n_fused(min_count=chosen.min_count)
-    _require_points(n_points, session, counts)
+    require_points(n_points, session, counts)
     label = cloud_label(calibration, session, chosen, len(shots))
     write_cloud(target, stitcher.grid.pieces(min_count=chosen.min_count), n_points, label)
     refinement, refined_out = _refined(calibration, session, chosen, stitcher.surfaces, target, shots) if chosen.refine else (None, None)
@@ -269,7 +265,7 @@ def _refined(
     if not found.n_pairs:
         return found, None
     stitcher = Stitcher(calibration, session, replace(settings, refine=False), spill_folder=unrefined.parent, motions=found.motions)
-    for _ in _fused_scans(stitcher, session, shots, settings.n_threads):
+    for _ in fused_scans(stitcher.add, session, shots, settings.n_threads):
         pass
     out = unrefined.with_name(f"{unrefined.stem}.refined{unrefined.suffix}")
     label = cloud_label(calibration, session, settings, len(shots), "refined by registration")
@@ -320,12 +316,14 @@ def n_workers(n_threads: int | None) -> int:
     return n_threads or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
 
 
-def _fused_scans(stitcher: Stitcher, session: Session, shots: Sequence[Shot], n_threads: int | None) -> Iterator[ScanCounts]:
+def fused_scans(
+    add: Callable[[Shot, PointCloud], ScanCounts], session: Session, shots: Sequence[Shot], n_threads: int | None
+) -> Iterator[ScanCounts]:
     """What became of each scan, in order; at most two a thread are in hand, so that memory does not grow with the scans."""
     n = n_workers(n_threads)
 
     def work(shot: Shot) -> ScanCounts:
-        return stitcher.add(shot, read_scan(session, shot))
+        return add(shot, read_scan(session, shot))
 
     with ThreadPoolExecutor(max_workers=n, thread_name_prefix="stitch") as pool:
         waiting: list[Future[ScanCounts]] = []
@@ -341,7 +339,12 @@ def _fused_scans(stitcher: Stitcher, session: Session, shots: Sequence[Shot], n_
                 future.cancel()
 
 
-def _require_points(n_points: int, session: Session, counts: ScanCounts) -> None:
+def require_points(n_points: int, session: Session, counts: ScanCounts) -> None:
+    """Refuse a cloud of which nothing is left.
+
+    Raises:
+        DataError: says where the points went.
+    """
     if n_points == 0:
         dropped = f"{counts.n_edge} at depth edges, {counts.n_grazing} seen too grazing, {counts.n_speck} in specks, {counts.n_outside} out of reach"
         raise DataError(

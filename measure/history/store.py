@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from calibrate import Calibration
 
 _SHORTEST_ID = 6
-_NOT_IN_DIGEST = ("seconds", "out", "history", "marked")
+_NOT_IN_DIGEST = ("seconds", "seconds_to_verdict", "stitch", "out", "history", "marked")
 _Row = TypeVar("_Row", CalibrationRow, ResultRow, ActivationRow)
 
 

@@ -54,7 +54,11 @@ def load_cloud(path: str | Path) -> MeasuredCloud:
         DataError: too few finite points, or farther away than any robot reaches.
     """
     file = Path(path)
-    cloud = read_ply(file) if file.suffix.lower() == ".ply" else parse_cloud(_bytes(file), file=file)
+    return cloud_of(read_ply(file) if file.suffix.lower() == ".ply" else parse_cloud(_bytes(file), file=file), file)
+
+
+def cloud_of(cloud: PointCloud, file: Path) -> MeasuredCloud:
+    """What is measured of a cloud that was read, or that has not been written yet; raises as `load_cloud`."""
     header = _header(cloud)
     _require_base_in_mm(header, file)
     points = cloud.points_mm.astype(np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,9 +25,7 @@ from measure.inspecting.quantities import Model, require_checks_fit
 from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, Inspection
 from measure.inspecting.spec import InspectionSpec, ProfileCheck
 from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance
-
-FieldSource = Callable[[Sequence[Response], FloatArray], FieldError]
-"""Makes the field of errors for some responses and part_from_base (4, 4)."""
+from measure.inspecting.views import FieldSource
 
 _DATUM_ROUNDS = 3
 _WIDER = 3.0
@@ -81,20 +79,18 @@ def inspect_cloud(
     responses = [*(with_form(fit.response, forms[name]) for name, fit in fits.items()), *([aligned.fitted.response] if aligned.fitted else [])]
     field = _field(cloud, spec, field_source, responses, aligned.part_from_base)
     covariance, sigmas = _covariances(responses, fits, forms, aligned.fitted, field, spec)
-    deviations = _deviations(cloud, surface, aligned, model, spec) if surface is not None and profile else None
+    alignment = _alignment_result(spec, aligned, model, covariance)
+    deviations = _deviations(cloud, surface, alignment.part_from_base, spec) if surface is not None and profile else None
     judged = {name: (form.form_mm, sigmas[name]) for name, form in forms.items()}
     judging = Judging(model, covariance, judged, problems, deviations, field.point_sigma_mm(), correlation, judge_corrected)
     features = tuple(feature_result(name, judging) for name in spec.features)
     checks = tuple(check_result(number, spec, judging) for number in range(len(spec.checks)))
     verdict, reasons = verdict_of(checks, spec, field, judging)
-    seconds = time.perf_counter() - began
-    if deviations is None and with_map:
-        deviations = _deviations(cloud, surface or NominalSurface.of(nominal), aligned, model, spec)
-    return Inspection(
+    found = Inspection(
         name=spec.name,
         verdict=verdict,
         reasons=reasons,
-        alignment=_alignment_result(spec, aligned, model, covariance),
+        alignment=alignment,
         features=features,
         checks=checks,
         n_points=len(cloud.points_mm),
@@ -108,10 +104,32 @@ def inspect_cloud(
             **_named(correlation),
         },
         notes=(*cloud.notes, *nominal.notes, *_on_correlation(correlation, checks)),
-        seconds_to_verdict=seconds,
+        seconds_to_verdict=time.perf_counter() - began,
         deviations=deviations,
         feature_points_in_part_mm={name: aligned.cloud.points_mm[fit.rows] for name, fit in fits.items()},
     )
+    return with_deviations(found, cloud, nominal, spec, surface) if with_map else found
+
+
+def with_deviations(
+    inspection: Inspection, cloud: MeasuredCloud, nominal: Nominal, spec: InspectionSpec, surface: NominalSurface | None = None
+) -> Inspection:
+    """The same inspection with its map of deviations, which no verdict waits for unless a check asks for it.
+
+    Args:
+        inspection: as `inspect_cloud` gave it.
+        cloud: the same.
+        nominal: the same.
+        spec: the same.
+        surface: of the nominal, where it is ready.
+
+    Raises:
+        DataError: nothing of the cloud lies on the part.
+    """
+    if inspection.deviations is not None:
+        return inspection
+    mapped = _deviations(cloud, surface or NominalSurface.of(nominal), inspection.alignment.part_from_base, spec)
+    return replace(inspection, deviations=mapped)
 
 
 def require_likely_units(cloud: MeasuredCloud, nominal: Nominal) -> None:
@@ -219,8 +237,8 @@ def _covariances(
     return everything.of_rows(np.delete(np.arange(len(rows)), at_form)), sigmas
 
 
-def _deviations(cloud: MeasuredCloud, surface: NominalSurface, aligned: _Aligned, model: Model, spec: InspectionSpec) -> DeviationMap:
-    points = se3.apply(model.alignment(), aligned.cloud.points_mm)
+def _deviations(cloud: MeasuredCloud, surface: NominalSurface, part_from_base: FloatArray, spec: InspectionSpec) -> DeviationMap:
+    points = se3.apply(part_from_base, cloud.points_mm)
     near = surface.nearest(points)
     signed = near.signed_mm - spec.surface.offset_mm
     kept = (np.abs(signed) <= spec.deviation_limit_mm) & ~near.at_border

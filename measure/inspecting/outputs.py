@@ -6,6 +6,7 @@ import csv
 import datetime
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,14 @@ def require_replaceable(folder: Path) -> None:
         raise SettingsError("exists and is no former inspection", file=folder, remedy="Name another folder with -o.")
 
 
-def write_outputs(folder: Path, inspection: Inspection, *, recording: bool = True) -> None:
+def write_outputs(folder: Path, inspection: Inspection, *, recording: bool = True, add: Callable[[Path], None] | None = None) -> None:
     """Write all files; the folder appears whole or not at all, and replaces a former inspection.
+
+    Args:
+        folder: where to.
+        inspection: what was found.
+        recording: whether the Rerun recording is wanted too.
+        add: puts further files into the folder before it appears.
 
     Raises:
         SettingsError: the folder holds something else.
@@ -52,6 +59,8 @@ def write_outputs(folder: Path, inspection: Inspection, *, recording: bool = Tru
         write_text_atomic(working / RESULT_FILE, json_text(inspection.to_json_dict()) + "\n")
         write_text_atomic(working / "features.csv", features_csv(inspection))
         write_text_atomic(working / "checks.csv", checks_csv(inspection))
+        if add is not None:
+            add(working)
         write_text_atomic(working / "inspection.html", render(page_of(inspection, datetime.datetime.now(datetime.UTC))))
         if inspection.deviations is not None:
             _write_deviations(working / "deviations.ply", inspection)

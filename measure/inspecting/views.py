@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from drivers.errors import DataError
-from drivers.files.session import Session, read_scan
+from drivers.files.ply import PointCloud
+from drivers.files.session import Session, Shot, read_scan
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.fitting import Response
-from measure.inspecting.uncertainty import SeenField
+from measure.inspecting.uncertainty import FieldError, SeenField
 from measure.placing import check_fits
 from measure.stitch import scans_once
 from measure.stitching.scan import KnowsItsErrors
+
+FieldSource = Callable[[Sequence[Response], FloatArray], FieldError]
+"""Makes the field of errors for some responses and part_from_base (4, 4)."""
 
 _POINTS_PER_VIEW = 6_000
 
@@ -51,13 +55,24 @@ def views_of(calibration: KnowsItsErrors, session: Session) -> list[View]:
         FileError: a scan is missing or broken.
     """
     check_fits(calibration, session)
-    found = []
-    for shot in scans_once(session):
-        points = read_scan(session, shot).points_mm
-        points = points[np.isfinite(points).all(axis=1)]
-        thinned = points[:: max(1, len(points) // _POINTS_PER_VIEW)].astype(np.float64)
-        found.append(View(thinned, shot.joints_rad, shot.base_from_flange))
-    return found
+    return [view_of(shot, read_scan(session, shot)) for shot in scans_once(session)]
+
+
+def view_of(shot: Shot, cloud: PointCloud) -> View:
+    """A scan, thinned."""
+    points = cloud.points_mm
+    points = points[np.isfinite(points).all(axis=1)]
+    thinned = points[:: max(1, len(points) // _POINTS_PER_VIEW)].astype(np.float64)
+    return View(thinned, shot.joints_rad, shot.base_from_flange)
+
+
+def field_of(calibration: KnowsItsErrors, views: Sequence[View]) -> FieldSource:
+    """What calibration and views tell of the errors that a cloud's points share, asked for once the part is aligned."""
+
+    def source(responses: Sequence[Response], part_from_base: FloatArray) -> FieldError:
+        return seen_field(calibration, views, responses, part_from_base)
+
+    return source
 
 
 def seen_field(calibration: KnowsItsErrors, views: Sequence[View], responses: Sequence[Response], part_from_base: FloatArray) -> SeenField:

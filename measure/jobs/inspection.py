@@ -3,50 +3,52 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.errors import DataError
+from drivers.errors import DataError, SettingsError
 from measure.jobs.outputs import RESULT_FILE
 
 if TYPE_CHECKING:
     from calibrate.result import Calibration
     from drivers.files.session import Session
-    from drivers.kinematics.se3 import FloatArray
-    from measure.inspecting.fitting import Response
-    from measure.inspecting.nominal import Nominal
-    from measure.inspecting.uncertainty import FieldError
+    from measure.jobs.model import Files
+    from measure.part import Drawing
+    from measure.stitch import StitchResult, StitchSettings
 
 FOLDER = "inspection"
 
 
-def inspect_part(calibration: Calibration, session: Session, cloud: Path, nominal: Path, spec: Path | None, working: Path) -> Mapping[str, object]:
-    """Inspect a part's cloud, write the pages and tables beside it, and give what `inspect --json` prints.
+def inspect_part(
+    calibration: Calibration, session: Session, settings: StitchSettings, files: Files, working: Path
+) -> tuple[StitchResult, Mapping[str, object]]:
+    """Stitch a part's scans and inspect the cloud, write it with pages and tables, and give what `inspect --json` prints.
 
     Args:
-        calibration: with which the cloud was stitched.
-        session: from which it was stitched.
-        cloud: the stitched cloud.
-        nominal: mesh of the part.
-        spec: inspection.yaml; None compares with the mesh alone.
+        calibration: with which the cloud is stitched.
+        session: of the part.
+        settings: of the stitching.
+        files: the mesh, and what is asked of the part; without a specification the cloud is compared with the mesh alone.
         working: the folder of this attempt.
 
     Raises:
         DataError: nothing of the cloud lies on the part, or it cannot be aligned.
-        FileError: mesh or specification is broken, or a check asks for what its feature does not have.
+        FileError: mesh, specification or a scan is broken, or a check asks for what its feature does not have.
         SettingsError: the datums fix no frame.
     """
-    from measure.inspecting.cloud import load_cloud
-    from measure.inspecting.inspection import inspect_cloud
+    from measure.inspecting.inspection import with_deviations
     from measure.inspecting.outputs import write_outputs
-    from measure.inspecting.spec import InspectionSpec, load_spec
+    from measure.part import measure_part
 
-    wanted = InspectionSpec(format="spherecal-inspection/1") if spec is None else load_spec(spec)
-    found = inspect_cloud(load_cloud(cloud), _nominal(nominal), wanted, field_source=_field_source(calibration, session))
+    drawing = _drawing(files)
+    # the place of an attempt means nothing to anybody later
+    part = measure_part(calibration, session, drawing, Path(), settings, spill_folder=working)
+    part.write_cloud(working)
+    found = with_deviations(part.inspection, part.cloud, drawing.nominal, drawing.spec)
     write_outputs(working / FOLDER, found, recording=False)
-    return {**found.to_json_dict(), "out": FOLDER}
+    return part.stitched, {**found.to_json_dict(), "out": FOLDER}
 
 
 def record_inspection(history: str, calibration: Calibration, file: Path, result_folder: Path) -> None:
@@ -77,20 +79,20 @@ def _unheard(_text: str) -> None:
 
 
 @lru_cache(maxsize=1)
-def _nominal(path: Path) -> Nominal:
-    """Read once a worker: the copy beside the results never changes."""
+def _drawing(files: Files) -> Drawing:
+    """Read once a worker: the copies beside the results never change.
+
+    Raises:
+        FileError: mesh, specification or correlation is broken.
+        SettingsError: there is no mesh.
+    """
+    from measure.gauge.correlation import load_correlation
     from measure.inspecting.nominal import load_nominal
+    from measure.inspecting.spec import InspectionSpec, load_spec
+    from measure.part import Drawing
 
-    return load_nominal(path)
-
-
-def _field_source(calibration: Calibration, session: Session) -> Callable[[Sequence[Response], FloatArray], FieldError]:
-    """What calibration and views tell of the errors that a cloud's points share."""
-    from measure.inspecting.views import seen_field, views_of
-
-    views = views_of(calibration, session)
-
-    def source(responses: Sequence[Response], part_from_base: FloatArray) -> FieldError:
-        return seen_field(calibration, views, responses, part_from_base)
-
-    return source
+    if files.nominal is None:
+        raise SettingsError("an inspection without a mesh", remedy="Name the mesh with --nominal.")
+    spec = InspectionSpec(format="spherecal-inspection/1") if files.spec is None else load_spec(files.spec)
+    correlation = None if files.correlation is None else load_correlation(files.correlation)
+    return Drawing(load_nominal(files.nominal), spec, correlation, files.judge_corrected)

@@ -31,11 +31,17 @@ class Recipe:
     """Of the mesh that clouds are compared with."""
     spec_sha256: str | None = None
     """Of the inspection.yaml."""
+    correlation_sha256: str | None = None
+    """Of the offsets to a reference gauge."""
+    judge_corrected: bool = False
+    """Whether what they name is judged by the corrected value."""
 
     @property
     def digest(self) -> str:
-        """sha256 over all of it."""
-        return _digest({"work": _WORK_VERSION, **asdict(self)})
+        """sha256 over all of it; a recipe without what later versions know is the one it was before them."""
+        later = {"correlation_sha256": None, "judge_corrected": False}
+        told = {name: value for name, value in asdict(self).items() if name not in later or value != later[name]}
+        return _digest({"work": _WORK_VERSION, **told})
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +52,8 @@ class Files:
     cell: Path | None = None
     nominal: Path | None = None
     spec: Path | None = None
+    correlation: Path | None = None
+    judge_corrected: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,12 +22,12 @@ from measure.jobs.marks import trust_in
 from measure.jobs.memory import TABLE_MB
 from measure.jobs.model import RESULT_FORMAT, Order, Outcome
 from measure.jobs.outputs import RESULT_FILE, attempt_folder, commit, read_result, result_folder
+from measure.part import CLOUD_FILE
 
 if TYPE_CHECKING:
     from calibrate.result import Calibration
     from drivers.files.session import Session
-
-CLOUD_FILE = "cloud.ply"
+    from measure.stitch import StitchResult
 
 
 def measure_part(order: Order) -> Outcome:
@@ -84,8 +84,7 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
     from measure.history.store import now_utc
 
     trust = trust_in(order.history, calibration, session)
-    stitched, marks = _stitched(order, calibration, session, working)
-    inspection = _inspected(order, calibration, session, working)
+    stitched, inspection = _stitched_and_inspected(order, calibration, session, working)
     result = {
         "format": RESULT_FORMAT,
         "part": order.job.part,
@@ -95,9 +94,9 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
         "calibration": {"id": calibration.id, "verdict": calibration.verdict, "created_utc": calibration.created_utc},
         "last_check": trust.last_check_data(),
         "taken_utc": last_taken_utc([session]),
-        "marks": [*marks, *trust.marks],
+        "marks": [*stitched.marks, *trust.marks],
         "verdict": None if inspection is None else inspection["verdict"],
-        "stitch": stitched,
+        "stitch": {**stitched.to_json_dict(), "out": CLOUD_FILE},
         "inspection": inspection,
         "seconds": time.perf_counter() - began,
         "attempt": order.attempt,
@@ -108,24 +107,20 @@ def _fill(order: Order, calibration: Calibration, session: Session, working: Pat
     return text
 
 
-def _stitched(order: Order, calibration: Calibration, session: Session, working: Path) -> tuple[Mapping[str, object], list[str]]:
-    """The cloud's facts, and what speaks against them."""
+def _stitched_and_inspected(
+    order: Order, calibration: Calibration, session: Session, working: Path
+) -> tuple[StitchResult, Mapping[str, object] | None]:
+    """What became of the scans, and of the cloud against its nominal where there is one."""
     from measure.stitch import StitchSettings, stitch
     from measure.stitching.scan import DEFAULT_CLEANING, NO_CLEANING
 
     cleaning = DEFAULT_CLEANING if order.recipe.clean_edges else NO_CLEANING
     settings = StitchSettings(order.recipe.voxel_mm, cleaning, memory_mb=TABLE_MB, n_threads=order.n_threads)
-    result = stitch(calibration, session, working / CLOUD_FILE, settings=settings)
-    return {**result.to_json_dict(), "out": CLOUD_FILE}, list(result.marks)
-
-
-def _inspected(order: Order, calibration: Calibration, session: Session, working: Path) -> Mapping[str, object] | None:
-    """The cloud against its nominal, where there is one."""
     if order.files.nominal is None:
-        return None
+        return stitch(calibration, session, working / CLOUD_FILE, settings=settings), None
     from measure.jobs.inspection import inspect_part
 
-    return inspect_part(calibration, session, working / CLOUD_FILE, order.files.nominal, order.files.spec, working)
+    return inspect_part(calibration, session, settings, order.files, working)
 
 
 @lru_cache(maxsize=2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import FileError, SettingsError
 from drivers.files.disk import sync_folder, usual_mode, write_atomic_pieces
-from drivers.files.ply import ply_header, read_ply
+from drivers.files.ply import PointCloud, ply_header, read_ply
 from measure.fuse import FusedCloud
 
 SUFFIXES = (".ply", ".pcd", ".e57", ".laz", ".las")
@@ -77,6 +77,13 @@ def write_cloud(out: Path, pieces: Iterable[FusedCloud], n_points: int, label: C
             _write_beside(out, lambda path: _write_e57(path, list(pieces), label))
         case _:
             _write_beside(out, lambda path: _write_las(path, pieces, label))
+
+
+def as_written(cloud: FusedCloud, label: CloudLabel) -> PointCloud:
+    """What `read_ply` gives of the PLY file that `write_cloud` makes of a cloud, without the file."""
+    records = _records(cloud)
+    points = np.column_stack([records[name] for name in ("x", "y", "z")])
+    return PointCloud(points, {name: records[name] for name in (_RECORD.names or ())[3:]}, label.comments)
 
 
 def read_fused(path: str | Path) -> FusedCloud:

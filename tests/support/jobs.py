@@ -21,7 +21,7 @@ from measure.jobs.parts import parts_in
 from measure.jobs.pool import Executor
 from measure.jobs.runner import Recorder, Runner, RunSettings, Summary
 from measure.jobs.work import measure_part
-from tests.support.recorded import nominal_calibration, record_session, write_cell
+from tests.support.recorded import PLACES, nominal_calibration, record_session, write_cell
 
 CAMERA = "CAM-1"
 
@@ -112,6 +112,22 @@ DAMAGE: dict[str, Callable[[Path], None]] = {
     "other camera": other_camera,
     "no shots": no_shots,
 }
+
+
+def draw_ball(folder: Path, *, tolerance_mm: float = 20.0) -> tuple[Path, Path]:
+    """Mesh and inspection.yaml of the sphere A that the parts hold."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=19.05)
+    mesh.apply_translation(PLACES["A"])
+    mesh.export(folder / "part.stl")
+    spec = {
+        "format": "spherecal-inspection/1",
+        "features": {"ball": {"kind": "sphere", "centre_mm": list(PLACES["A"]), "diameter_mm": 38.1, "axis": [0, 0, 1], "cap_deg": 80}},
+        "checks": [{"kind": "diameter", "feature": "ball", "name": "ball", "tolerance": tolerance_mm}],
+    }
+    (folder / "inspection.yaml").write_text(dump_yaml(spec), encoding="utf-8")
+    return folder / "part.stl", folder / "inspection.yaml"
 
 
 class InPlace:

@@ -15,7 +15,7 @@ from calibrate.result import Calibration
 from drivers.errors import FileError
 from drivers.files.ply import read_ply
 from drivers.files.session import read_session
-from drivers.files.yaml import dump_yaml
+from measure.gauge.correlation import Correlation, Offset, save_correlation
 from measure.history.store import History
 from measure.jobs import outputs
 from measure.jobs import runner as runner_module
@@ -27,11 +27,10 @@ from measure.jobs.memory import estimated_mb
 from measure.jobs.model import Files, Order, Outcome, Recipe
 from measure.jobs.outputs import attempt_folder, clear_abandoned, commit
 from measure.jobs.parts import MARKER
-from measure.jobs.work import CLOUD_FILE
+from measure.part import CLOUD_FILE
 from measure.stitch import stitch
 from tests.support.job_works import light, moody
-from tests.support.jobs import DAMAGE, InPlace, Parts, make_parts, read_lines, run_jobs, without_joints
-from tests.support.recorded import PLACES
+from tests.support.jobs import DAMAGE, InPlace, Parts, draw_ball, make_parts, read_lines, run_jobs, without_joints
 
 EXPECTED = {
     "truncated scan": "is cut off",
@@ -376,20 +375,12 @@ def test_scans_with_poses_are_measured_like_the_session_they_came_from(good: Par
 
 
 def test_with_a_mesh_a_part_is_inspected_and_kept_in_the_history(good: Parts, tmp_path: Path) -> None:
-    import trimesh
-
     shutil.rmtree(good.folder / good.good[1])
-    mesh = trimesh.creation.icosphere(subdivisions=3, radius=19.05)
-    mesh.apply_translation(PLACES["A"])
-    mesh.export(tmp_path / "part.stl")
-    spec = {
-        "format": "spherecal-inspection/1",
-        "features": {"ball": {"kind": "sphere", "centre_mm": list(PLACES["A"]), "diameter_mm": 38.1, "axis": [0, 0, 1], "cap_deg": 80}},
-        "checks": [{"kind": "diameter", "feature": "ball", "tolerance": 20.0}],
-    }
-    (tmp_path / "inspection.yaml").write_text(dump_yaml(spec), encoding="utf-8")
+    mesh, spec = draw_ball(tmp_path)
+    offset = Offset(-0.5, 0.01, 0.01, 5, 1.0, slope_is_one=True)
+    save_correlation(Correlation({"ball": offset}), tmp_path / "correlation.yaml")
     calibration = Calibration.load(good.calibration)
-    files = Files(good.calibration, nominal=tmp_path / "part.stl", spec=tmp_path / "inspection.yaml")
+    files = Files(good.calibration, nominal=mesh, spec=spec, correlation=tmp_path / "correlation.yaml", judge_corrected=True)
     place = str(tmp_path / "history.sqlite")
 
     def keep(folder: Path) -> None:
@@ -404,6 +395,11 @@ def test_with_a_mesh_a_part_is_inspected_and_kept_in_the_history(good: Parts, tm
         written = json.loads((folder / "inspection" / "inspection.json").read_text(encoding="utf-8"))
         assert result["verdict"] == written["verdict"] == result["inspection"]["verdict"]
         assert (folder / "inspection" / "inspection.html").is_file()
+        (check,) = written["checks"]
+        assert (check["judged"], check["corrected"]["value_mm"]) == ("corrected", pytest.approx(check["measured"] - 0.5))
+        stitched = stitch(calibration, read_session(good.folder / good.good[0]), tmp_path / "alone.ply")
+        assert (folder / CLOUD_FILE).read_bytes() == (tmp_path / "alone.ply").read_bytes()
+        assert (result["stitch"]["n_points"], result["stitch"]["n_scans"]) == (stitched.n_points, stitched.n_scans)
         verdicts[result["part"]] = result["verdict"]
         keep(folder)  # as after a kill: told twice, kept once
     with History.open(place) as history:
