@@ -49,6 +49,8 @@ class ExternalShotResult:
     """(3,) robot's less reference's place of the target, stated base."""
     predicted_error_mm: float | None
     """Distance from where a solve without this shot expects the target."""
+    joints_rad: FloatArray | None = None
+    """(n,) where the robot stood; None in files of older versions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +128,7 @@ def external_result(
                 point_in_reference_mm=shot.point_in_reference_mm,
                 residual_mm=datum.base_from_solver[:3, :3] @ residual[i],
                 predicted_error_mm=float(held_out[i]) if np.isfinite(held_out[i]) else None,
+                joints_rad=shot.joints_rad,
             )
             for i, shot in enumerate(points.shots)
         ),
@@ -200,6 +203,7 @@ def _shot(data: object) -> ExternalShotResult:
         point_in_reference_mm=_array(data["point_in_reference_mm"], 3),
         residual_mm=_array(data["residual_mm"], 3),
         predicted_error_mm=_number(data["predicted_error_mm"]),
+        joints_rad=None if data.get("joints_rad") is None else np.asarray(data["joints_rad"], dtype=np.float64),
     )
 
 

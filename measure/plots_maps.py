@@ -78,6 +78,7 @@ def depth_slices_svg(slices: Sequence[DepthSlice]) -> Drawn:
             for row, (values, levels, colours) in enumerate((error, uncertainty)):
                 panel = panels[row, column]
                 images[row] = panel.contourf(one.x_mm, one.y_mm, values, levels=levels, cmap=colours, extend="both" if row == 0 else "max")
+                images[row].set_rasterized(True)
                 _hatch_unseen(panel, one)
                 panel.set_aspect("equal")
                 panel.grid(visible=False)
@@ -146,7 +147,8 @@ def _hatch_unseen(panel: Any, one: DepthSlice) -> None:
     if one.seen.all():
         return
     unseen = np.where(one.seen, 0.0, 1.0)
-    panel.contourf(one.x_mm, one.y_mm, unseen, levels=[0.5, 1.5], colors=["#ffffff"], alpha=0.55)
+    panel.contourf(one.x_mm, one.y_mm, unseen, levels=[0.5, 1.5], colors=["#ffffff"], alpha=0.55).set_rasterized(True)
     hatched = panel.contourf(one.x_mm, one.y_mm, unseen, levels=[0.5, 1.5], colors="none", hatches=["////"])
     hatched.set_edgecolor(_UNSEEN_COLOUR)
     hatched.set_linewidth(0.0)
+    hatched.set_rasterized(True)

@@ -106,12 +106,12 @@ def camera_maps_svg(maps: CameraMaps) -> Drawn:
 
 def _mesh(panel: Any, one: BinnedMap, largest_mm: float, *, factor: float = 1.0) -> Any:
     x, y = factor * one.x_edges, factor * one.y_edges
-    # not the panel's own face: the page's pictures are saved without it
-    panel.fill_between(x[[0, -1]], y[0], y[-1], color=_EMPTY_COLOUR, linewidth=0, zorder=0)
+    panel.set_facecolor(_EMPTY_COLOUR)
     panel.grid(visible=False)
     panel.set_xlim(x[0], x[-1])
     panel.set_ylim(y[0], y[-1])
-    return panel.pcolormesh(x, y, np.ma.masked_invalid(one.mean_mm), cmap=_COLOURS, vmin=-largest_mm, vmax=largest_mm)
+    # a picture in the picture: thousands of rectangles would be most of a page's size
+    return panel.pcolormesh(x, y, np.ma.masked_invalid(one.mean_mm), cmap=_COLOURS, vmin=-largest_mm, vmax=largest_mm, rasterized=True)
 
 
 def _largest_mm(maps: Sequence[BinnedMap]) -> float:

@@ -90,6 +90,8 @@ def result_rows(facts: CalibrationFacts, verification: VerifyResult | None) -> t
 
 def _scatter_rows(verification: VerifyResult) -> list[Row]:
     after, before = verification.figures, verification.before
+    if after.radial_rms_mm is None:
+        return []
     radial = _row(
         "radial rms",
         "How far the single points of all shots lie from one common sphere: scatter of the shots and noise of the camera together.",
@@ -116,7 +118,8 @@ def _length_rows(verification: VerifyResult) -> list[Row]:
     worst = _worst_length(verification)
     if worst is None:
         return []
-    help_text = "Measured minus certified distance of two spheres: the test that sees a wrong scale or a bent base, which repeatability cannot."
+    ends = "targets, by the robot less by the reference" if verification.of_points_alone else "spheres"
+    help_text = f"Measured minus certified distance of two {ends}: the test that sees a wrong scale or a bent base, which repeatability cannot."
     before = _largest(verification.before_length_errors_mm.values())
     mark = _mark(verification, [f"length {x.label}" for x in verification.lengths])
     limit = _limit(verification.limits, "length_error_mm")
@@ -125,6 +128,8 @@ def _length_rows(verification: VerifyResult) -> list[Row]:
 
 def _shape_rows(verification: VerifyResult) -> list[Row]:
     after, before = verification.figures.spheres, {} if verification.before is None else verification.before.spheres
+    if not after:
+        return []
     sizes = [_largest(s.diameter_error_mm for s in side.values()) for side in (before, after)]
     forms = [_largest(s.form_mm for s in side.values()) for side in (before, after)]
     limits = verification.limits
@@ -143,6 +148,9 @@ def result_lead(verification: VerifyResult | None) -> str:
     if verification is None:
         return "No verification was given. The only honest figure of a calibration alone is its prediction of shots that were left out of the solve."
     unseen = " that the calibration never saw" if verification.held_out else ""
+    if verification.of_points_alone:
+        points = f"{verification.used} of {verification.n_shots} external reference points{unseen}"
+        return f"Figures on {points}: the robot alone, no sphere was seen."
     places = len(verification.figures.spheres)
     seen = f"{verification.used} of {verification.n_shots} shots{unseen}, of {places} sphere{'' if places == 1 else 's'}"
     if verification.before is None:
@@ -162,7 +170,9 @@ def tables_of(facts: CalibrationFacts, verification: VerifyResult | None) -> tup
         tuple((name, str(index), reason) for name, index, reason in rejected),
         numeric=False,
     )
-    return (last,) if verification is None else (_length_table(verification), _sphere_table(verification), last)
+    if verification is None:
+        return (last,)
+    return (_length_table(verification), *(() if verification.of_points_alone else (_sphere_table(verification),)), last)
 
 
 def calibration_rows(facts: CalibrationFacts) -> tuple[Row, ...]:
@@ -245,6 +255,11 @@ def _length_table(verification: VerifyResult) -> Table:
         for x in verification.lengths
     )
     lead = "Between centres fitted on all views of each sphere together, in mm. U holds calibration, scatter and certificate."
+    if verification.of_points_alone:
+        lead = (
+            "Between external reference points, each in one length, in mm: where the calibrated robot expects the target, against the distance that "
+            "the reference measured (certified). U holds calibration, pose noise and noise of the reference. Where it stands does not come in."
+        )
     return Table("Lengths between places", lead, ("length", "certified", "measured", "error before", "error", "U (k = 2)"), rows)
 
 

@@ -100,10 +100,15 @@ class Figures:
 
     views: tuple[ViewFigures, ...]
     spheres: dict[str, SphereFigures]
-    radial_rms_mm: float
+    radial_rms_mm: float | None
+    """None without a view."""
     centre_rms_mm: float | None
     """sqrt(mean |c_j - mean(c)|²), each sphere about its own mean, pooled; None without two views of a sphere."""
     centre_max_mm: float | None
+
+
+NO_FIGURES = Figures((), {}, None, None, None)
+"""Of no view at all: external reference points alone."""
 
 
 def figures_of(views: Sequence[SphereView], sizes: Mapping[str, SphereSize], *, line_profile: bool) -> Figures:

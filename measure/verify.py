@@ -30,15 +30,16 @@ from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import overall
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
-from measure.proof.external import external_figures, judgeable
+from measure.proof.external import external_figures, judgeable, known_external
+from measure.proof.external_lengths import external_gaps, external_lengths
 from measure.proof.judging import gaps_of, judgements
 from measure.proof.lengths import length_results
 from measure.proof.poses import repeated_poses, training_shots
 from measure.proof.probing import ProbingResult, probing_of
-from measure.proof.reach import shots_outside, warnings_of
+from measure.proof.reach import external_outside, shots_outside, warnings_of
 from measure.proof.residual_maps import residual_maps
 from measure.proof.volume import volume_figures
-from measure.sphere_figures import Figures, SphereSize, SphereView, figures_of, separation
+from measure.sphere_figures import NO_FIGURES, Figures, SphereSize, SphereView, figures_of, separation
 from measure.verify_result import SessionName, VerifyResult
 
 Placing = Callable[[SphereShot, FloatArray], FloatArray]
@@ -64,7 +65,7 @@ def verify(
             `not_proven` at best.
 
     Raises:
-        DataError: no shot shows a sphere; shots or poses of the calibration itself; sessions whose cells contradict
+        DataError: no shot shows a sphere or a known external target; shots or poses of the calibration itself; sessions whose cells contradict
             each other.
         FileError: a session is broken.
     """
@@ -106,7 +107,7 @@ def verify_observations(
 
     Args:
         calibration: the calibration to judge.
-        observations: with at least one shot.
+        observations: with at least one shot or external point. Points judge where there is no sphere; beside spheres they are told.
         cell: spheres and lengths as large as they were when seen.
         limits: what to judge against; None for none.
         flattery: what training data are among the shots, in sentences; the verdict then is `not_proven` at best.
@@ -119,13 +120,16 @@ def verify_observations(
     sizes = {name: SphereSize(s.radius_mm, calibration.radius_offset_mm) for name, s in cell.spheres.items()}
     views = views_of(observations.shots, calibrated_placing(calibration), calibration.noise)
     _require_still_spheres(views, cell.spheres, folders)
-    figures = figures_of(views, sizes, line_profile=line_profile)
-    lengths = length_results(calibration, cell.lengths, figures, observations.shots)
+    figures = figures_of(views, sizes, line_profile=line_profile) if views else NO_FIGURES
+    lengths = (
+        length_results(calibration, cell.lengths, figures, observations.shots) if views else external_lengths(calibration, observations.external)
+    )
     volume = volume_figures(lengths, cell.work_volume_box_mm)
-    outside = shots_outside(calibration, observations.shots)
+    outside = (*shots_outside(calibration, observations.shots), *external_outside(calibration, observations.external))
     judged = () if limits is None else judgements(limits, figures, lengths, cell.spheres)
     external = external_figures(calibration, observations.external)
-    verdict, reasons = overall(judged, gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery))
+    of_points = () if views else external_gaps(calibration, observations.external)
+    verdict, reasons = overall(judged, [*gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery), *of_points])
     return VerifyResult(
         calibration_id=calibration.id,
         sessions=(),
@@ -144,12 +148,12 @@ def verify_observations(
         volume=volume,
         outside=outside,
         warnings=(
-            *warnings_of(outside, len(observations.shots)),
+            *warnings_of(outside, len(observations.shots) + len(observations.external)),
             *(() if volume is None else volume.warnings()),
             *(() if external is None else external.warnings()),
         ),
         external=external,
-        maps=residual_maps(observations.shots, views, figures, sizes),
+        maps=residual_maps(observations.shots, views, figures, sizes) if views else None,
     )
 
 
@@ -201,7 +205,9 @@ def _behind_surface(shot: SphereShot) -> FloatArray:
 def _flattery(calibration: JudgedSystem, sessions: Sequence[Session], *, allowed: bool) -> list[str]:
     """What of the calibration's own is among the shots; DataError where that is not allowed."""
     told = []
-    scans, poses = training_shots(calibration.shots, sessions), repeated_poses(calibration.shots, sessions)
+    external = known_external(calibration)
+    points = () if external is None else external.shots
+    scans, poses = training_shots(calibration.shots, sessions, points), repeated_poses(calibration.shots, sessions, points)
     if scans and not allowed:
         raise _refused(f"{len(scans)} shots are those that the calibration was made from, so they prove nothing", scans[0])
     if poses and not allowed:
@@ -229,12 +235,11 @@ def _gather(calibration: JudgedSystem, sessions: Sequence[Session], cells: Seque
     external = [shot for part in parts for shot in part.external]
     judged, not_judged = judgeable(calibration, external)
     rejected = (*(shot for part in parts for shot in part.rejected), *not_judged)
-    if not shots and external and not any(part.rejected for part in parts):
-        remedy = "Name a session with shots of spheres; `spherecal calibrate` itself judges the robot on points left out."
-        raise DataError("the session holds external reference points alone; verification looks at spheres", file=sessions[0].folder, remedy=remedy)
-    if not shots:
+    if not shots and not judged:
         why = f"; the first refusal was: {rejected[0].reason}" if rejected else ""
-        raise DataError(f"none of {len(rejected)} shots shows a sphere{why}", file=sessions[0].folder, remedy="Capture shots of the spheres.")
+        raise DataError(
+            f"none of {len(rejected)} shots shows a sphere or a known target{why}", file=sessions[0].folder, remedy="Capture shots of the spheres."
+        )
     return Observations(tuple(shots), rejected, judged)
 
 
@@ -277,7 +282,7 @@ def _figures_before(
 ) -> Figures | None:
     """The same shots by the nominal robot and the first guess of the hand-eye."""
     guess = {session.digest: cell.flange_from_camera for session, cell in zip(sessions, cells, strict=True)}
-    if any(transform is None for transform in guess.values()):
+    if not observations.shots or any(transform is None for transform in guess.values()):
         return None
 
     def place(shot: SphereShot, points: FloatArray) -> FloatArray:

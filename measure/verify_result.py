@@ -58,7 +58,7 @@ class VerifyResult:
     warnings: tuple[str, ...] = ()
     """What a reader must know of these figures besides the verdict's reasons."""
     external: ExternalFigures | None = None
-    """External reference points, told beside the spheres and not judged against a limit; None where there was none to judge."""
+    """External reference points, told beside the spheres; judged by the lengths between them where no sphere was seen."""
     maps: ResidualMaps | None = field(default=None, repr=False)
     """What the report draws of the points."""
 
@@ -74,8 +74,13 @@ class VerifyResult:
 
     @property
     def used(self) -> int:
-        """Shots that the figures stand on."""
-        return len(self.observations.shots)
+        """Shots and external points that the figures stand on."""
+        return len(self.observations.shots) + len(self.observations.external)
+
+    @property
+    def of_points_alone(self) -> bool:
+        """Whether external reference points alone were judged: lengths are then between them."""
+        return not self.figures.spheres
 
     @property
     def rejected(self) -> tuple[RejectedShot, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from calibrate.datum import link_columns, term_columns
 from calibrate.external import external_sigma_mm
 from calibrate.external_points import ExternalShot
-from calibrate.external_result import ExternalFrame
+from calibrate.external_result import ExternalFrame, ExternalResult
 from calibrate.observations import RejectedShot
 from calibrate.result import Calibration
 from calibrate.robot_terms import load_basis
@@ -25,7 +25,6 @@ from drivers.kinematics.se3 import FloatArray
 from measure.placing import MeasuringSystem
 
 _NO_FRAMES = "external reference point: the calibration was made without any, so it does not know where the reference stands"
-_TRAINING = "external reference point that the calibration was made from: it proves nothing"
 _FAR = 2.0
 """Rms beyond this many times the expected one is told."""
 
@@ -106,62 +105,88 @@ class ExternalFigures:
         }
 
 
+def known_external(calibration: MeasuringSystem) -> ExternalResult | None:
+    """Frames, targets and points that a calibration of the whole robot was made from; None where there were none."""
+    return calibration.external if isinstance(calibration, Calibration) and calibration.model is not None else None
+
+
 def judgeable(calibration: MeasuringSystem, shots: Sequence[ExternalShot]) -> tuple[tuple[ExternalShot, ...], tuple[RejectedShot, ...]]:
-    """The points that this calibration can be held against, and the others with a reason."""
+    """The points whose target this calibration knows, and the others with a reason."""
     reasons = [_why_not(calibration, shot) for shot in shots]
     rejected = [RejectedShot(shot.session, shot.index, why) for shot, why in zip(shots, reasons, strict=True) if why is not None]
     return tuple(shot for shot, why in zip(shots, reasons, strict=True) if why is None), tuple(rejected)
 
 
 def _why_not(calibration: MeasuringSystem, shot: ExternalShot) -> str | None:
-    known = calibration.external if isinstance(calibration, Calibration) and calibration.model is not None else None
+    known = known_external(calibration)
     if known is None:
         return _NO_FRAMES
-    for kind, name, names in (("reference", shot.reference, known.references), ("target", shot.target, known.targets)):
-        if name not in names:
-            return f"external reference point: the calibration does not know {kind} {name} (it knows {', '.join(names)})"
-    if any(np.array_equal(shot.point_in_reference_mm, used.point_in_reference_mm) for used in known.shots):
-        return _TRAINING
+    if shot.target not in known.targets:
+        return f"external reference point: the calibration does not know target {shot.target} (it knows {', '.join(known.targets)})"
     return None
 
 
 def external_figures(calibration: MeasuringSystem, shots: Sequence[ExternalShot]) -> ExternalFigures | None:
-    """Errors of points that are `judgeable`; None of none."""
-    if not shots or not isinstance(calibration, Calibration):
+    """Errors of the points whose reference and target a calibration knows; None of none."""
+    known = known_external(calibration)
+    if known is None or not isinstance(calibration, Calibration):
         return None
-    return ExternalFigures(tuple(_error(calibration, shot) for shot in shots))
+    placed = [shot for shot in shots if shot.target in known.targets and shot.reference in known.references]
+    return ExternalFigures(tuple(_error(calibration, known.references[shot.reference], shot) for shot in placed)) if placed else None
 
 
-def _error(calibration: Calibration, shot: ExternalShot) -> ExternalError:
-    if calibration.external is None or calibration.model is None:
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedTarget:
+    """Where a calibration expects a target at a stop."""
+
+    seen_mm: FloatArray
+    """(3,) in the stated base."""
+    lever_mm: FloatArray
+    """(3,) from the flange's origin."""
+    motion: FloatArray
+    """(3, P) of it per unknown of the calibration."""
+
+
+def placed_target(calibration: Calibration, shot: ExternalShot) -> PlacedTarget:
+    """The target of a shot that is `judgeable`."""
+    known = known_external(calibration)
+    if known is None or calibration.model is None:
         raise ValueError("not a judgeable point")
-    frame, target = calibration.external.references[shot.reference], calibration.external.targets[shot.target].point_in_flange_mm
     frames = calibration.base_from_links(shot.joints_rad)[None]
     flange = frames[0, -1]
-    seen = se3.apply(flange, target)
-    told = se3.apply(frame.base_from_reference, shot.point_in_reference_mm)
+    seen = se3.apply(flange, known.targets[shot.target].point_in_flange_mm)
     load = load_basis(calibration.terms, calibration.model, shot.joints_rad[None])
     blocks = {
         "link1.rho_x_mm": link_columns(calibration.link_twists, frames, seen[None])[0],
-        f"reference.{shot.reference}.rho_x_mm": _frame_columns(calibration, frame, told),
         f"target.{shot.target}.x_mm": flange[:3, :3],
     }
     if calibration.terms:
         blocks[f"{calibration.terms[0].name}_rad"] = term_columns(calibration.link_twists, frames, load, seen[None])[0]
-    at = np.concatenate([calibration.parameter_names.index(first) + np.arange(block.shape[1]) for first, block in blocks.items()])
-    jacobian = np.concatenate(list(blocks.values()), axis=1)
-    covariance = jacobian @ calibration.covariance[np.ix_(at, at)] @ jacobian.T + _noise_mm2(calibration, seen - flange[:3, 3])
-    return ExternalError(shot.session, shot.index, shot.reference, shot.target, seen - told, covariance)
+    motion = np.zeros((3, len(calibration.parameter_names)))
+    for first, block in blocks.items():
+        at = calibration.parameter_names.index(first)
+        motion[:, at : at + block.shape[1]] += block
+    return PlacedTarget(seen, seen - flange[:3, 3], motion)
 
 
-def _frame_columns(calibration: Calibration, frame: ExternalFrame, told_mm: FloatArray) -> FloatArray:
+def _error(calibration: Calibration, frame: ExternalFrame, shot: ExternalShot) -> ExternalError:
+    placed = placed_target(calibration, shot)
+    told = se3.apply(frame.base_from_reference, shot.point_in_reference_mm)
+    jacobian = placed.motion.copy()
+    at = calibration.parameter_names.index(f"reference.{shot.reference}.rho_x_mm")
+    jacobian[:, at : at + 6] = _frame_columns(calibration, told)
+    covariance = jacobian @ calibration.covariance @ jacobian.T + noise_mm2(calibration, placed.lever_mm)
+    return ExternalError(shot.session, shot.index, shot.reference, shot.target, placed.seen_mm - told, covariance)
+
+
+def _frame_columns(calibration: Calibration, told_mm: FloatArray) -> FloatArray:
     """(3, 6) motion of the error, stated axes, by a left twist of the frame in the solver's base."""
     base_from_solver = calibration.datum.base_from_solver
     in_solver = se3.apply(se3.inverse(base_from_solver), told_mm)
     return np.asarray(base_from_solver[:3, :3] @ np.concatenate([-np.eye(3), se3.hat(in_solver)], axis=1))
 
 
-def _noise_mm2(calibration: Calibration, lever_mm: FloatArray) -> FloatArray:
+def noise_mm2(calibration: Calibration, lever_mm: FloatArray) -> FloatArray:
     """(3, 3) of the stop's pose noise at a lever (3,) from the flange, and of the tracker."""
     noise, lever = calibration.noise, se3.hat(lever_mm)
     alike = noise.pose_mm**2 + external_sigma_mm(noise) ** 2

@@ -34,9 +34,9 @@ def gaps_of(limits: Limits | None, figures: Figures, lengths: Sequence[LengthRes
     gaps = list(flattery)
     if limits is None:
         gaps.append("no limits given")
-    if figures.centre_rms_mm is None and not line_profile:
+    if figures.spheres and figures.centre_rms_mm is None and not line_profile:
         gaps.append("no sphere was seen twice: the scatter of centres is unknown")
     gaps += [f"length {length.label} not judged: {length.not_judged}" for length in lengths if length.not_judged]
     if not lengths:
-        gaps.append("no certified length was measured: scale and shape of the base are not tested")
+        gaps.append(f"no {'certified ' if figures.spheres else ''}length was measured: scale and shape of the base are not tested")
     return gaps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +21,55 @@ _SAME_AXES_RAD = 0.01
 """Axis angles nearer than this on every axis are; the same flange pose by another branch of the arm is another pose."""
 
 
-def training_shots(known: Sequence[TrainingShot], sessions: Sequence[Session]) -> list[tuple[Session, int]]:
-    """Shots (session, index) whose scans a calibration was made from, wherever they lie now."""
+class TrainingPoint(Protocol):
+    """One external reference point that a calibration was made from."""
+
+    @property
+    def reference(self) -> str:
+        """Frame in which it was measured."""
+        ...
+
+    @property
+    def target(self) -> str:
+        """Point on the flange."""
+        ...
+
+    @property
+    def point_in_reference_mm(self) -> FloatArray:
+        """(3,) as measured."""
+        ...
+
+    @property
+    def joints_rad(self) -> FloatArray | None:
+        """(n,) where the robot stood; None where it is not known."""
+        ...
+
+
+def training_shots(known: Sequence[TrainingShot], sessions: Sequence[Session], points: Sequence[TrainingPoint] = ()) -> list[tuple[Session, int]]:
+    """Shots (session, index) whose scans or external points a calibration was made from, wherever they lie now."""
     digests = {shot.scan_sha256 for shot in known}
-    return [(session, shot.index) for session in sessions for shot in session.shots if shot.sha256 in digests]
+    measured = {(point.reference, point.target, *point.point_in_reference_mm.tolist()) for point in points}
+
+    def is_known(shot: Shot) -> bool:
+        if shot.point_in_reference_mm is not None:
+            return (shot.reference, shot.target, *shot.point_in_reference_mm.tolist()) in measured
+        return shot.sha256 in digests
+
+    return [(session, shot.index) for session in sessions for shot in session.shots if is_known(shot)]
 
 
-def repeated_poses(known: Sequence[TrainingShot], sessions: Sequence[Session]) -> list[tuple[Session, int]]:
-    """Shots (session, index) with a sphere, taken where the robot stood for a shot of the calibration.
+def repeated_poses(known: Sequence[TrainingShot], sessions: Sequence[Session], points: Sequence[TrainingPoint] = ()) -> list[tuple[Session, int]]:
+    """Shots (session, index) of a sphere or an external target, taken where the robot stood for one of the calibration, of either kind.
 
     Empty for calibrations of older versions, which did not keep their poses.
     """
-    joints = [shot.joints_rad for shot in known if shot.joints_rad is not None]
+    stood = [*(shot.joints_rad for shot in known), *(point.joints_rad for point in points)]
+    joints = [joints_rad for joints_rad in stood if joints_rad is not None]
     flanges = [shot.base_from_flange for shot in known if shot.base_from_flange is not None]
     found = []
     for session in sessions:
         for shot in session.shots:
-            if shot.status == "ok" and shot.sphere is not None and _repeats(shot, joints, flanges):
+            if shot.status == "ok" and (shot.sphere is not None or shot.is_reference_point) and _repeats(shot, joints, flanges):
                 found.append((session, shot.index))
     return found
 

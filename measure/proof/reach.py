@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from calibrate.external_points import ExternalShot
 from calibrate.observations import SphereShot
 from drivers.kinematics.se3 import FloatArray
 
@@ -46,6 +47,7 @@ class OutsideShot:
     session: str
     index: int
     sphere: str
+    """Or target on the flange."""
     what: tuple[str, ...]
     """In words, one for each way it is outside."""
 
@@ -58,6 +60,12 @@ def shots_outside(calibration: KnowsItsReach, shots: Sequence[SphereShot]) -> tu
         if what:
             found.append(OutsideShot(shot.session, shot.index, shot.sphere, what))
     return tuple(found)
+
+
+def external_outside(calibration: KnowsItsReach, points: Sequence[ExternalShot]) -> tuple[OutsideShot, ...]:
+    """The external points of some whose stops lie beyond the calibrated axis ranges."""
+    found = [(point, tuple(_beyond_axes(calibration.seen_joints_rad, point))) for point in points]
+    return tuple(OutsideShot(point.session, point.index, point.target, what) for point, what in found if what)
 
 
 def warnings_of(outside: Sequence[OutsideShot], n_shots: int) -> tuple[str, ...]:
@@ -85,7 +93,7 @@ def _beyond_camera(box_mm: FloatArray, shot: SphereShot) -> list[str]:
     return found
 
 
-def _beyond_axes(ranges_rad: FloatArray | None, shot: SphereShot) -> list[str]:
+def _beyond_axes(ranges_rad: FloatArray | None, shot: SphereShot | ExternalShot) -> list[str]:
     if ranges_rad is None or shot.joints_rad is None:
         return []
     low, high = np.degrees(ranges_rad)

@@ -50,11 +50,12 @@ def _external(result: VerifyResult) -> Table:
         errors = [f"{e:+.3f} ± {u:.3f}" for e, u in zip(point.error_mm, point.expanded_uncertainty_mm, strict=True)]
         name = f"{result.session_name(point.session)}, shot {point.index}"
         rows.append((name, point.reference, point.target, *errors, f"{point.distance_mm:.3f}"))
+    judged = "Judged by the lengths between them, above." if result.of_points_alone else "Told and not judged."
     together = "" if found is None else f"All together: {found.rms_mm:.3f} rms, where these uncertainties expect {found.expected_rms_mm:.3f}. "
     return Table(
         "External reference points",
         "Where the calibrated robot expects a target minus where the reference saw it, in the base, with U (k = 2) of this difference: calibration "
-        f"of robot, reference and target, pose noise, noise of the reference. {together}The camera does not come in. Told and not judged. mm.",
+        f"of robot, reference and target, pose noise, noise of the reference. {together}The camera does not come in. {judged} mm.",
         ("point", "reference", "target", "x", "y", "z", "distance"),
         tuple(rows),
     )

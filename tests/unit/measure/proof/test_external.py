@@ -13,6 +13,7 @@ from calibrate.solve import calibrate
 from drivers.files.session import read_session
 from drivers.kinematics import se3
 from measure.proof.external import external_figures, judgeable
+from measure.proof.external_lengths import external_gaps, external_lengths
 from tests.support.recorded import TrueSystem
 from tests.support.synthetic import paper_cell
 from tests.support.tracker import TrackedRobot, tracked_robot, tracker_cell_data, write_tracker_session
@@ -89,14 +90,50 @@ def _stepped(calibration: Calibration, name: str, step: float) -> Calibration:
     return replace(calibration, external=replace(external, references={"tracker": replace(frame, base_from_reference=pose)}))
 
 
+def test_lengths_are_as_wrong_as_they_say_and_blind_to_where_the_tracker_stands(calibration: Calibration) -> None:
+    shots = unseen(80)
+    lengths = external_lengths(calibration, shots)
+    assert len(lengths) == 40
+    assert len({name for length in lengths for name in length.between}) == 80  # every point once
+    error, u = (np.array([getattr(x, key) for x in lengths]) for key in ("error_mm", "expanded_uncertainty_mm"))
+    assert 0.85 < np.mean(np.abs(error) < u) <= 1.0
+    assert 0.5 < np.sqrt(np.mean((2 * error / u) ** 2)) < 1.4
+    new_from_old = se3.from_rotation_translation(se3.exp_so3([0.3, -1.0, 0.4]), [500.0, 70, -80])
+    moved = [replace(shot, reference="new", point_in_reference_mm=se3.apply(new_from_old, shot.point_in_reference_mm)) for shot in shots]
+    again = external_lengths(calibration, moved[::-1])
+    np.testing.assert_allclose([x.error_mm for x in again], error, atol=1e-6)
+    # a scale error of the robot, as a wrong link length makes it, shows at its size on the longest
+    longer = [replace(shot, point_in_reference_mm=1.001 * shot.point_in_reference_mm) for shot in shots]
+    shift = error - [x.error_mm for x in external_lengths(calibration, longer)]
+    np.testing.assert_allclose(shift, [0.001 * x.reference_mm for x in lengths], rtol=1e-6)
+
+
+def test_the_uncertainty_of_a_length_follows_every_unknown_of_the_solve(calibration: Calibration) -> None:
+    names, shots = calibration.parameter_names, unseen(2)
+    quiet = replace(calibration, noise=replace(calibration.noise, pose_mm=1e-9, pose_rad=1e-12, external_mm=1e-9))
+    for name in ("link2.phi_z_rad", "target.reflector.z_mm"):
+        step = 1e-4
+        only = replace(quiet, covariance=np.diag(np.eye(len(names))[names.index(name)]) * step**2)
+        here, there = (external_lengths(system, shots)[0] for system in (only, _stepped(quiet, name, step)))
+        assert here.expanded_uncertainty_mm / 2 == pytest.approx(abs(there.measured_mm - here.measured_mm), rel=2e-3)
+
+
+def test_points_alone_do_not_judge_a_camera_and_few_judge_nothing(calibration: Calibration) -> None:
+    assert external_gaps(calibration, unseen(12)) == []
+    assert len(external_gaps(calibration, unseen(9))) == 1
+    assert external_lengths(TrueSystem(paper_cell()), unseen(12)) == ()
+
+
 def test_points_that_cannot_be_judged_have_a_reason(calibration: Calibration) -> None:
     good, *rest = unseen(3)
-    trained = ROBOT.shots(np.random.default_rng(32), 40)[7]
-    shots = [good, replace(rest[0], reference="other"), replace(rest[1], target="elbow"), trained]
+    elsewhere = replace(rest[0], reference="other")
+    shots = [good, elsewhere, replace(rest[1], target="elbow")]
     kept, rejected = judgeable(calibration, shots)
-    assert kept == (good,)
-    words = ("reference other", "target elbow", "proves nothing")
-    assert [word in shot.reason for word, shot in zip(words, rejected, strict=True)] == [True] * 3
+    assert kept == (good, elsewhere)  # a tracker that was set up anew still measures lengths
+    assert [shot.reason for shot in rejected] == ["external reference point: the calibration does not know target elbow (it knows reflector)"]
+    found = external_figures(calibration, kept)
+    assert found is not None
+    assert [point.reference for point in found.points] == ["tracker"]
     assert external_figures(calibration, ()) is None
     system = TrueSystem(paper_cell())
-    assert [("made without any" in shot.reason) for shot in judgeable(system, shots)[1]] == [True] * 4
+    assert [("made without any" in shot.reason) for shot in judgeable(system, shots)[1]] == [True] * 3
