@@ -5,6 +5,8 @@ protocol is that of docs/abb_protocol.md; `TRIG id q1..q6` is acknowledged, `RES
 
     EXPOSING   the robot must stand          EXPOSED   it may move on, the picture is being judged
     OK         kept, and good                NG why    not good, and why
+
+Where parts are inspected, `RESULT 0` after the last picture asks for the part's own OK or NG (`measure.serve_part`).
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import queue
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,11 +30,17 @@ from acquire.sphere import SphereNotFound, SphereSettings
 from drivers.abb.answers import Answerer, Declined
 from drivers.abb.protocol import LAST_NUMBER, MASTER_VERBS, N_AXES, VERSION, Fault, Line, Verb, numbers, whole
 from drivers.errors import CameraError, CameraLost, SpherecalError
+from drivers.files.ply import PointCloud
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import Camera3D
 
+if TYPE_CHECKING:
+    from measure.serve_part import PartLine
+
 EXPOSING, EXPOSED, OK, NG = "EXPOSING", "EXPOSED", "OK", "NG"
+PART = 0
+"""The number that stands for the part as a whole."""
 _SAME_POSE_RAD = 0.01
 _LONGEST_REASON = 48
 _FRAME_TIMEOUT_S = 10.0
@@ -77,7 +86,9 @@ class Orders:
 class CellDesk:
     """Answers the controller; a trigger becomes a job in the queue."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, judges_parts: bool = False) -> None:
+        """A desk; where it judges parts, RESULT 0 closes the part at work and asks for its verdict, and the next trigger begins another."""
+        self._judges_parts = judges_parts
         self._answers = Answerer(self._do, MASTER_VERBS)
         self._lock = threading.Lock()
         self._jobs: dict[int, Job] = {}
@@ -99,14 +110,29 @@ class CellDesk:
         number = whole(line.arguments[0], LAST_NUMBER)
         if line.word == Verb.TRIGGER:
             return self._take(number, line)
-        job = self._jobs.get(number)
+        job = self._closed_part() if self._judges_parts and number == PART else self._jobs.get(number)
         if job is None:
             raise Declined(Fault.TOKEN, "no such trigger")
-        return str(number), job.state, *_words(job.reason)
+        state = EXPOSING if job.id == PART and self._is_exposing() else job.state
+        return str(number), state, *_words(job.reason)
+
+    def _is_exposing(self) -> bool:
+        return any(job.state == EXPOSING for job in self._jobs.values())
+
+    def _closed_part(self) -> Job:
+        if PART not in self._jobs:
+            # to the controller it is as a picture that is being judged: its programs for pictures serve for parts
+            self._jobs[PART] = Job(PART, np.zeros(0), EXPOSED)
+            self.waiting.put(self._jobs[PART])
+        return self._jobs[PART]
 
     def _take(self, number: int, line: Line) -> tuple[str, ...]:
-        if any(job.state == EXPOSING for job in self._jobs.values()):
+        if self._judges_parts and number == PART:
+            raise Declined(Fault.TOKEN, "0 is the part")
+        if self._is_exposing():
             raise Declined(Fault.BUSY, "exposing")
+        if self._judges_parts and PART in self._jobs:
+            self._jobs.clear()
         job = Job(number, np.radians(numbers(line.arguments[1:], N_AXES)))
         self._jobs[number] = job
         self.waiting.put(job)
@@ -125,12 +151,15 @@ class CellWorker:
     cell: Cell
     model: RobotModel | None
     camera: Camera3D
-    writer: SessionWriter
+    writer: SessionWriter | None
+    """None where `parts` opens a session for each."""
     orders: Orders
     tell: Callable[[Job], None] = lambda _: None
     """Called when a job is done."""
     frames: int = 1
     sphere_settings: SphereSettings = field(default_factory=SphereSettings)
+    parts: PartLine | None = None
+    """Where parts are inspected; it then gives the session of each."""
     told: Mapping[str, str] = field(default_factory=dict)
     """What the camera told of itself when it was opened; a lost one that comes back must tell the same."""
     counts: dict[str, int] = field(default_factory=lambda: {OK: 0, NG: 0})
@@ -140,21 +169,43 @@ class CellWorker:
 
     def __post_init__(self) -> None:
         """Know what a resumed session holds."""
-        self._last = {shot.pose_id: shot.index for shot in self.writer.shots if shot.pose_id is not None and shot.status == "ok"}
+        held = () if self.writer is None else self.writer.shots
+        self._last = {shot.pose_id: shot.index for shot in held if shot.pose_id is not None and shot.status == "ok"}
 
     def work(self, waiting: queue.Queue[Job | None], most: int | None = None) -> None:
-        """Work until None comes, or so many pictures are good. A camera whose link was lost is opened anew for the next picture.
+        """Work until None comes, or so many pictures are good; where parts are judged, until so many are.
+
+        A camera whose link was lost is opened anew for the next picture.
 
         Raises:
             FileError: the session cannot be written.
             CameraError: the camera is set wrongly or not there, which another picture will not mend.
         """
+        n_parts = 0
         while (job := waiting.get()) is not None:
-            self._take(job)
-            self.counts[job.state] += 1
-            self.tell(job)
-            if most is not None and self.counts[OK] >= most:
+            if self.parts is not None and job.id == PART:
+                self._judge_part(self.parts, job)
+                n_parts += 1
+            else:
+                self._take(job)
+                self.counts[job.state] += 1
+                self.tell(job)
+            if most is not None and (n_parts if self.parts is not None else self.counts[OK]) >= most:
                 return
+
+    def _judge_part(self, parts: PartLine, job: Job) -> None:
+        def told(verdict: str, reason: str) -> None:
+            job.reason = "" if verdict == "conform" else f"{verdict}: {reason}"
+            job.state = OK if verdict == "conform" else NG
+
+        self._last = {}
+        parts.judge(told)
+
+    def _session(self) -> SessionWriter:
+        writer = self.writer if self.parts is None else self.parts.begin()
+        if writer is None:
+            raise ValueError("neither a session nor parts")
+        return writer
 
     def _take(self, job: Job) -> None:
         sphere, hindrance = self.orders.of(job)
@@ -200,7 +251,7 @@ class CellWorker:
         pose_id = self.orders.pose_id(job)
         frames = () if exposure is None else exposure.frames
         try:
-            shot = self.writer.append(
+            shot = self._session().append(
                 sphere=sphere,
                 joints_rad=job.joints_rad,
                 xyz_mm=average(frames) if frames else None,
@@ -218,5 +269,7 @@ class CellWorker:
             raise
         if reason is None:
             self._last[pose_id] = shot.index
+            if self.parts is not None:
+                self.parts.add(shot, PointCloud(average(frames).astype(np.float32)))
         job.index, job.reason = shot.index, reason or ""
         job.state = OK if reason is None else NG
