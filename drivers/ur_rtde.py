@@ -15,6 +15,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from drivers.ur.arm import Arm, read_arm
 from drivers.ur.link import Child
 from drivers.ur.net import Deadline, address_of
 from drivers.ur.preflight import preflight
-from drivers.ur.reading import check_can_move, failure_of, reason_of, state_of
+from drivers.ur.reading import check_can_move, failure_of, reason_of, state_of, tool_fits
 from drivers.ur.settings import UrSettings, ur_settings
 
 __all__ = ["UrRobot", "UrSettings", "make_robot"]
@@ -74,6 +75,8 @@ class UrRobot:
         self._broken: RobotError | None = None
         self._remote: bool | None = None
         self._arm: Arm | None = None
+        self._sees_tool = False
+        """Whether a change of tool shows: the controller's kinematics and tool, as told here, give its own pose."""
 
     def open(self) -> RobotInfo:
         """Knock, shake hands, ask who it is, and start reading.
@@ -93,6 +96,7 @@ class UrRobot:
         try:
             self._ask("connect", deadline)
             self.read_state()
+            self._sees_tool = self._arm is not None and tool_fits(self._arm, self._raw()) is True
         except BaseException:  # Ctrl-C among them
             self.close()
             raise
@@ -160,7 +164,7 @@ class UrRobot:
         """Stop, take the script off the controller, and hang up."""
         child, self._child = self._child, None
         lost = self._touched and self._broken is not None
-        self._controlled, self._touched, self._broken = False, False, None
+        self._controlled, self._touched, self._broken, self._sees_tool = False, False, None, False
         if child is not None and lost:
             child.kill()
         elif child is not None:
@@ -235,7 +239,18 @@ class UrRobot:
         return self._ask("state", Deadline.after(SILENCE_S))
 
     def _state(self, raw: Mapping[str, Any]) -> RobotState:
-        return state_of(raw, self._arm, self._remote)
+        return state_of(raw, self._arm_now(raw), self._remote)
+
+    def _arm_now(self, raw: Mapping[str, Any]) -> Arm | None:
+        """The arm with the tool that a reading's pose is of: somebody may select another one at the pendant at any time."""
+        if not self._sees_tool or self._arm is None or tool_fits(self._arm, raw):
+            return self._arm
+        anew = read_arm(self._address, Deadline.after(_ARM_S))
+        if anew is not None and tool_fits(anew, raw):
+            log.warning("another tool was selected on the controller; flange poses do without it")
+            self._arm = anew
+            return anew
+        return replace(self._arm, flange_from_tcp=None)  # of the moment of the change: no flange pose rather than a wrong one
 
     def _ask(self, what: str, deadline: Deadline, **arguments: object) -> dict[str, Any]:
         if self._broken is not None:
@@ -271,4 +286,6 @@ class UrRobot:
             log.warning("%s", note)
         if self._arm is None or self._arm.flange_from_tcp is None:
             notes.append("the active tool could not be read, so there is no flange pose")
+        elif not self._sees_tool:
+            notes.append("select no other tool (TCP) during a session: it would not be noticed")
         return tuple(notes)

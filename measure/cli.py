@@ -16,7 +16,7 @@ import typer
 from measure.cli_abb import abb_program
 from measure.cli_camera_check import camera_check
 from measure.cli_capture import capture
-from measure.cli_cell import doctor, new_cell
+from measure.cli_cell import doctor, new_cell, new_truth
 from measure.cli_check import check
 from measure.cli_controller import simulate_controller
 from measure.cli_demo import demo
@@ -49,6 +49,7 @@ app = typer.Typer(
 
 new = typer.Typer(help="Write a new file to start from.", no_args_is_help=True, rich_markup_mode=None)
 new.command("cell")(new_cell)
+new.command("truth")(new_truth)
 
 VERBS: tuple[tuple[str, Callable[..., None], str], ...] = (
     ("demo", demo, "Go the whole way on a simulated cell."),

@@ -56,6 +56,30 @@ def new_cell(
         run.finish({"out": str(out)})
 
 
+def new_truth(
+    cell: Annotated[Path, typer.Argument(help="The cell file: robot model, spheres with their places, lengths, boxes.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write.")] = Path("truth.yaml"),
+    seed: Annotated[int, typer.Option(min=0, help="Another seed is another robot and another camera.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    quiet: Quiet = False,
+) -> None:
+    """Draw what a simulated cell truly is, for `driver: simulated` and `simulate-controller --cell`."""
+    with command(as_json, debug, quiet) as run:
+        from acquire.cell import load_cell
+        from drivers.errors import SettingsError
+        from drivers.simulated.truth_file import write_truth
+        from measure.new_truth import truth_of_cell
+
+        if out.exists() and not force:
+            raise SettingsError("exists already", file=out, remedy="Name another file with -o, or replace it with --force.")
+        truth = truth_of_cell(load_cell(cell), seed)
+        write_truth(truth, out)
+        run.console.say(f"{out} written: a robot and a camera with errors that nobody but the simulation may read")
+        run.finish({"out": str(out), "spheres": list(truth.spheres)})
+
+
 def _asked(ask: bool, question: str, default: str) -> str:
     return str(typer.prompt(question, default=default, err=True)) if ask else default
 

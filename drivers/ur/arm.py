@@ -21,6 +21,8 @@ from drivers.ur.net import PRIMARY_PORT, Deadline, connect, receive
 
 MM_PER_M = 1000.0
 _N_PROBES = 20
+_SAME_TOOL_MM, _SAME_TOOL_RAD = 1.0, 2e-3
+"""What a pose of the tool may differ from the controller's own kinematics before another tool is suspected."""
 _KINEMATICS = struct.Struct(">6I24dI")
 _CARTESIAN = struct.Struct(">12d")
 
@@ -46,6 +48,14 @@ class Arm:
         for i in range(angle.shape[-1]):
             result = result @ _link(angle[..., i], float(self.d_mm[i]), float(self.a_mm[i]), float(self.alpha_rad[i]))
         return result
+
+    def tool_fits(self, base_from_tcp: FloatArray, joints_rad: FloatArray) -> bool | None:
+        """Whether a reported pose (4, 4) is that of the tool known here, at axis angles (6,); None where that cannot be told."""
+        own = self.base_from_flange(joints_rad)
+        if own is None or self.flange_from_tcp is None:
+            return None
+        off = se3.inverse(own @ self.flange_from_tcp) @ base_from_tcp
+        return bool(np.linalg.norm(off[:3, 3]) < _SAME_TOOL_MM and np.linalg.norm(se3.log_so3(off[:3, :3])) < _SAME_TOOL_RAD)
 
     def deviation_mm(self, model: RobotModel) -> float | None:
         """Largest distance between flange positions of this arm and of a model, over poses all over the axes' ranges."""

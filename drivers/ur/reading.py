@@ -77,6 +77,11 @@ def state_of(raw: Mapping[str, Any], arm: Arm | None, remote: bool | None) -> Ro
     )
 
 
+def tool_fits(arm: Arm, raw: Mapping[str, Any]) -> bool | None:
+    """Whether the pose of a child's reading is that of the arm's tool; None where that cannot be told."""
+    return arm.tool_fits(pose_transform(np.array(raw["pose"])), np.array(raw["q"]))
+
+
 def reason_of(raw: Mapping[str, Any]) -> str | None:
     """Why the robot cannot move, in the controller's words; None if nothing is in the way."""
     found = []

@@ -338,6 +338,24 @@ def test_an_active_tool_is_named_and_the_flange_stays_the_flange(controller: Fak
     np.testing.assert_allclose(with_tool, bare, atol=1e-9)
 
 
+def test_a_tool_that_is_changed_in_mid_session_is_seen(controller: FakeUr, robot: UrRobot) -> None:
+    """The flange pose stays the flange's at every reading, or is none; the tool's new name is told."""
+    before = robot.read_state()
+    assert before.base_from_flange is not None
+    controller.fault("tool 0.01 -0.02 0.15 0.1 0.2 -0.3")
+    try:
+        until_s = time.monotonic() + 3 * SILENCE_S
+        while (state := robot.read_state()).active_tool in ("tool0", None):
+            assert time.monotonic() < until_s
+            if state.base_from_flange is not None:
+                np.testing.assert_allclose(state.base_from_flange, before.base_from_flange, atol=1e-6)
+    finally:
+        controller.fault("tool 0 0 0 0 0 0")
+    assert state.base_from_flange is not None
+    np.testing.assert_allclose(state.base_from_flange, before.base_from_flange, atol=1e-6)
+    assert "10.000 -20.000 150.000" in str(state.active_tool)
+
+
 def test_hand_guiding(controller: FakeUr, robot: UrRobot) -> None:
     robot.start_freedrive()
     controller.fault("push " + " ".join(str(angle) for angle in AWAY))
