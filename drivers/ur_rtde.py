@@ -100,7 +100,7 @@ class UrRobot:
         except BaseException:  # Ctrl-C among them
             self.close()
             raise
-        return RobotInfo("ur_rtde", who.model or None, who.serial or None, f"PolyScope {version}", self._notes())
+        return RobotInfo("ur_rtde", who.model or None, who.serial or None, f"PolyScope {version}", self._notes(who.program))
 
     def read_state(self) -> RobotState:
         """A reading that came while it was waited for; one that a busy computer has let grow old on the way is asked for again.
@@ -274,8 +274,9 @@ class UrRobot:
             self._broken = error
         return error
 
-    def _notes(self) -> tuple[str, ...]:
-        notes = []
+    def _notes(self, program: str | None) -> tuple[str, ...]:
+        is_ours = program is None or any(name in program for name in _SCRIPTS)
+        notes = [] if is_ours else [f"the program {program!r} runs on the controller: motions are refused until somebody stops it there"]
         if self._model is not None:
             deviation_mm = None if self._arm is None else self._arm.deviation_mm(self._model)
             if deviation_mm is None:

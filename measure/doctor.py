@@ -128,8 +128,10 @@ def robot_hints(state: RobotState) -> list[str]:
     hints = []
     if state.motors_on is False:
         hints.append("the motors are off, so motions will be refused. Switch them on at the pendant")
-    if state.mode in (Mode.LOCAL, Mode.MANUAL):
-        hints.append(f"it is in {state.mode} mode, so motions will be refused; hand guiding works")
+    if state.mode == Mode.LOCAL:
+        hints.append("it is in local mode, so motions will be refused; hand guiding works")
+    if state.mode == Mode.MANUAL:
+        hints.append("it is in manual mode: motions are slow, and need somebody who holds the enabling switch")
     if state.active_tool not in (None, "tool0"):
         hints.append(f"the active tool is {state.active_tool}; axis angles do not depend on it")
     return hints

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 
-from drivers.errors import RobotError, RobotNotReached
+from drivers.errors import RobotError, RobotNotReached, RobotTimeout
 from drivers.ur.net import DASHBOARD_PORT, Deadline, connect, receive, send
 
 ASK_S = 0.5
@@ -24,6 +24,8 @@ class Identity:
     """Whether programs and clients may command it; None where the software has no such mode (before 5.6)."""
     robot_mode: str
     safety: str
+    program: str | None
+    """That runs or is held, None where there is none."""
 
 
 def ask(host: str, *questions: str, deadline: Deadline) -> list[str]:
@@ -47,18 +49,32 @@ def ask(host: str, *questions: str, deadline: Deadline) -> list[str]:
 
         if _GREETING not in line():
             raise _no_dashboard(host)
-        answers = []
+        answers: list[str] = []
         for question in questions:
             send(link, question.encode() + b"\n", deadline)
-            answers.append(line())
+            try:
+                answers.append(line())
+            except RobotTimeout as error:
+                if not answers:
+                    raise
+                found = f"answers too slowly ({len(answers)} of {len(questions)} questions in time)"
+                raise RobotTimeout(found, file=error.file, remedy="Is the network overloaded? Use a cable of its own for the robot.") from error
         return answers
 
 
 def identity(host: str, deadline: Deadline) -> Identity:
     """Who it is; raises as `ask`."""
-    questions = ("PolyscopeVersion", "get robot model", "get serial number", "is in remote control", "robotmode", "safetystatus")
-    software, model, serial, remote, mode, safety = ask(host, *questions, deadline=deadline)
-    return Identity(software, _known(model), _known(serial), _remote(remote), mode.removeprefix("Robotmode: "), safety.removeprefix("Safetystatus: "))
+    questions = ("PolyscopeVersion", "get robot model", "get serial number", "is in remote control", "robotmode", "safetystatus", "programState")
+    software, model, serial, remote, mode, safety, program = ask(host, *questions, deadline=deadline)
+    return Identity(
+        software=software,
+        model=_known(model),
+        serial=_known(serial),
+        remote=_remote(remote),
+        robot_mode=mode.removeprefix("Robotmode: "),
+        safety=safety.removeprefix("Safetystatus: "),
+        program=_program(program),
+    )
 
 
 def in_remote_control(host: str, deadline: Deadline) -> bool | None:
@@ -68,8 +84,7 @@ def in_remote_control(host: str, deadline: Deadline) -> bool | None:
 
 def running_program(host: str, deadline: Deadline) -> str | None:
     """The program that runs or is held, None where there is none; raises as `ask`."""
-    state, _, name = ask(host, "programState", deadline=deadline)[0].partition(" ")
-    return None if state.upper() == "STOPPED" else name or state
+    return _program(ask(host, "programState", deadline=deadline)[0])
 
 
 def end_program(host: str, deadline: Deadline) -> None:
@@ -88,6 +103,11 @@ def answers(host: str) -> bool:
 
 def _remote(text: str) -> bool | None:
     return {"true": True, "false": False}.get(text.strip().lower())
+
+
+def _program(text: str) -> str | None:
+    state, _, name = _known(text).partition(" ")
+    return None if state.upper() in ("STOPPED", "") else name or state
 
 
 def _known(text: str) -> str:

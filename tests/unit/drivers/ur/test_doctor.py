@@ -85,6 +85,18 @@ class TestDoctor:
         assert any("motors are off" in hint for hint in robot["hints"])
         assert any("local mode" in hint for hint in robot["hints"])
 
+    def test_a_program_of_somebody_else_runs(self, controller: FakeUr, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        controller.fault("foreign_program")
+        robot = told(cell(tmp_path, controller.host), capfd)
+        assert any("program 'production.urp' runs" in hint for hint in robot["hints"])
+
+    def test_it_answers_too_slowly(self, controller: FakeUr, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        controller.fault("lag 0.2")
+        robot = told(cell(tmp_path, controller.host), capfd)
+        assert robot["ok"] is False
+        assert "too slowly" in robot["problems"][0]
+        assert "cable of its own" in robot["problems"][0]
+
     @pytest.mark.parametrize(
         "settings",
         [
