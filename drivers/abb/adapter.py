@@ -110,7 +110,7 @@ class AbbRobot:
         try:
             arguments = self._client.ask(Verb.HELLO, timeout_s=0.8 * SILENCE_S).line.arguments
         except RobotTimeout as error:
-            remedy = "Is spherecal.mod running there, and does no other program hold the connection? An emergency stop holds the program, too."
+            remedy = "Is spherecal.mod running there, and does no other program hold the connection? Emergency stop and stop button hold it, too."
             raise RobotTimeout(error.message, where=error.where, remedy=remedy) from error
         version, epoch = self._read(lambda: (whole(arguments[0], 99), whole(arguments[1], LAST_EPOCH)))
         if version != VERSION:

@@ -16,7 +16,7 @@ SETTINGS = {
     "serial_port": "serial port of this computer, e.g. /dev/ttyUSB0; this or host",
     "baud": f"speed of the serial line, {SLOWEST_BAUD} or more (default 38400)",
     "state_port": "port of the second program spherecal_state.mod (needs 623-1 Multitasking); none by default",
-    "tool": "name of the tool that the program uses, if it is another than tool0 or sphFlange",
+    "tool": "name of the tool that the program uses, if it is another than tool0 or sphTool",
     "work_object": "name of the work object, if it is another than wobj0",
     "flange_pose": "true (default): read the flange pose while the robot stands, as a cross-check; false: axis angles only",
     "watchdog_s": "1 to 30 (default 3): the program stops a motion when it hears nothing for so long",

@@ -81,6 +81,10 @@ MODULE Spherecal
 
     PROC SphServe()
         IF NOT sphBegun SphBegin;
+        ! PP to Routine or PP to Cursor keep the variables: whatever was under way or asked for is over.
+        IF sphOutcome=SPH_RUNNING sphOutcome:=SPH_HELD;
+        sphTokenNo:=0;
+        sphGo:=FALSE;
         sphStop:=FALSE;
         sphHeldNow:=FALSE;
         sphMoving:=FALSE;

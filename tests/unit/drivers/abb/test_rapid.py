@@ -295,6 +295,21 @@ def test_a_motion_that_was_asked_for_and_held_before_it_began_does_not_begin() -
     assert world.moves_begun == 0
 
 
+def test_after_pp_to_routine_what_was_asked_for_is_over() -> None:
+    """PP to SphServe keeps the variables: neither a GO nor a motion under way is gone on with, and a token is none any more."""
+    for before in ({"sphGo": True}, {"sphMoving": True}, {"sphTokenNo": np.float32(100)}):
+        world = script((0.1, target(30.0)))
+        world.ends_s = 0.5
+        world.run()
+        outcome = Outcome.NONE if "sphTokenNo" in before else Outcome.RUNNING
+        world.machine.data.update(before, sphGivenAt=np.float32(0.4), sphOutcome=np.float32(outcome))
+        world.script, world.ends_s = [(0.7, go()), (0.9, encode(4, Verb.LAST))], 2.0
+        world.run()
+        assert told(world, "E")[-1][0] == str(int(Fault.TOKEN))
+        assert told(world, "L")[0][2] == str(int(Outcome.NONE if "sphTokenNo" in before else Outcome.HELD))
+        assert world.moves_begun == 0
+
+
 def test_after_pp_to_main_nothing_of_before_is_known() -> None:
     def pp_to_main(world: World) -> None:
         world.pp_main = True
