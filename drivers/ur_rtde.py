@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ChannelTaken, MotionRefused, RobotError, RobotNotReached, RobotTimeout, StaleReading
+from drivers.errors import ChannelTaken, MotionRefused, RobotError, RobotNotReached, RobotTimeout, StaleReading, WrongController
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import CONNECT_S, MAX_AGE_S, SILENCE_S, RobotInfo, RobotState
@@ -31,7 +31,7 @@ from drivers.ur.arm import Arm, read_arm
 from drivers.ur.link import Child
 from drivers.ur.net import Deadline, address_of
 from drivers.ur.preflight import preflight
-from drivers.ur.reading import check_can_move, failure_of, reason_of, state_of, tool_fits
+from drivers.ur.reading import check_can_move, check_sound, failure_of, reason_of, state_of, tool_fits
 from drivers.ur.settings import UrSettings, ur_settings
 
 __all__ = ["UrRobot", "UrSettings", "make_robot"]
@@ -239,6 +239,11 @@ class UrRobot:
         return self._ask("state", Deadline.after(SILENCE_S))
 
     def _state(self, raw: Mapping[str, Any]) -> RobotState:
+        try:
+            check_sound(raw)
+        except WrongController as error:
+            self._broken = error
+            raise
         return state_of(raw, self._arm_now(raw), self._remote)
 
     def _arm_now(self, raw: Mapping[str, Any]) -> Arm | None:

@@ -8,7 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ChannelTaken, LinkLost, MotionRefused, MotorsOff, NotInRemoteControl, RobotError, RobotTimeout, StaleReading
+from drivers.errors import (
+    ChannelTaken,
+    LinkLost,
+    MotionRefused,
+    MotorsOff,
+    NotInRemoteControl,
+    RobotError,
+    RobotTimeout,
+    StaleReading,
+    WrongController,
+)
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import Mode, RobotState, Safety
@@ -56,6 +66,8 @@ _ROBOT_MODES = {
 _RUNTIMES = {0: "STOPPING", 1: "STOPPED", 2: "PLAYING", 3: "PAUSING", 4: "PAUSED", 5: "RESUMING"}
 _RUNNING, _PLAYING, _NORMAL = 7, 2, (1, 2)
 _SAME_TOOL_MM, _SAME_TOOL_RAD = 1e-3, 1e-6
+# a UR's axes turn twice round at most; lengths of a pose are in m, its rotation vector in rad
+_LARGEST_RAD, _LARGEST_RAD_S, _LARGEST_POSE = 13.0, 10.0, 100.0
 _LOOK = "Look at the pendant, then continue with --resume."
 
 
@@ -75,6 +87,19 @@ def state_of(raw: Mapping[str, Any], arm: Arm | None, remote: bool | None) -> Ro
         active_tool=tool_name(tool),
         active_work_object="wobj0",  # UR reports in the base frame, whatever feature is active
     )
+
+
+def check_sound(raw: Mapping[str, Any]) -> None:
+    """Nothing, if a child's reading can be one.
+
+    Raises:
+        WrongController: not six axis angles, speeds and components of a pose, or impossible ones.
+    """
+    for key, largest in (("q", _LARGEST_RAD), ("qd", _LARGEST_RAD_S), ("pose", _LARGEST_POSE)):
+        values = np.array(raw[key], dtype=np.float64)
+        if values.shape != (6,) or not (np.abs(values) <= largest).all():
+            found = f"a reading makes no sense: {key} is {[float(f'{value:.3g}') for value in values]}"
+            raise WrongController(found, remedy="Is this a UR, and nothing between it and this computer that changes what is sent? Open it again.")
 
 
 def tool_fits(arm: Arm, raw: Mapping[str, Any]) -> bool | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import re
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 _BETWEEN_PIECES_S = 0.002
 _MOST_UNREAD = 1 << 16
 _LONGEST_SCRIPT = 1 << 20
+_HEAD = 4
+"""Bytes of size, type and recipe of a data package."""
 
 
 class Connection(asyncio.Protocol):
@@ -102,6 +105,10 @@ class RtdeConnection(Connection):
         self.session.due_s = max(self.session.due_s + self.session.period_s, now_s - self.session.period_s) + line.slow_s
         self.session.frozen_s = (self.session.frozen_s or self.controller.machine.timestamp_s) if line.stale else None
         data = self.session.data()
+        if line.garbage:
+            data = data[:_HEAD] + random.randbytes(len(data) - _HEAD)
+        elif line.noise:
+            data = random.randbytes(len(data))
         self.answer(data[: len(data) // 2] if line.half else data)
 
 

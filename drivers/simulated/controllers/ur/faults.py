@@ -14,6 +14,8 @@ WIRE_FAULTS = {
     "silence": "connections are accepted, nothing is sent any more",
     "half_packets": "half a package comes, then nothing",
     "fragments": "every package comes in two pieces",
+    "garbage": "packages hold random values: no numbers, impossible angles, modes that there are not",
+    "noise": "random bytes come instead of packages",
     "drop": "all RTDE connections are cut now; the robot goes on",
     "drop_commanding": "the RTDE connections that write inputs are cut, those that read stay",
     "drop_mid_move": "all of them, 0.1 s after the next motion has begun",
@@ -56,6 +58,8 @@ class LineState:
     half: bool = False
     """The next data package is cut in half, then all is silent."""
     stale: bool = False
+    garbage: bool = False
+    noise: bool = False
     slow_s: float = 0.0
     lag_s: float = 0.0
     drop_after_s: float | None = None

@@ -194,7 +194,7 @@ class UrController:
                 self._vanish()
             case "black_hole":
                 await self._swallow()
-            case "silence" | "half_packets" | "fragments" | "stale":
+            case "silence" | "half_packets" | "fragments" | "stale" | "garbage" | "noise":
                 setattr(line, {"silence": "silent", "half_packets": "half"}.get(name, name), True)
             case "drop" | "drop_commanding":
                 self._drop(commanding_only=name == "drop_commanding")

@@ -33,6 +33,7 @@ from drivers.errors import (
     SafetyStop,
     SpherecalError,
     StaleReading,
+    WrongController,
 )
 from drivers.models import load_robot_model
 from drivers.protocols import CONNECT_S, MAX_AGE_S, SILENCE_S, Mode, Safety
@@ -97,6 +98,9 @@ def test_open(controller: FakeUr, fault: str, kind: type[RobotError]) -> None:
     [
         ("drop", LinkLost),
         pytest.param("half_packets", RobotTimeout, marks=pytest.mark.qualify),
+        # what is wrong shows in the values, in the time stamp, or in ur_rtde's end
+        ("garbage", (WrongController, RobotTimeout, LinkLost)),
+        pytest.param("noise", (WrongController, RobotTimeout, LinkLost), marks=pytest.mark.qualify),
         pytest.param("refuse", LinkLost, marks=pytest.mark.qualify),
         pytest.param("restart 60", LinkLost, marks=pytest.mark.qualify),
         pytest.param("lag 0.2", StaleReading, marks=pytest.mark.qualify),
@@ -107,13 +111,13 @@ def test_open(controller: FakeUr, fault: str, kind: type[RobotError]) -> None:
         pytest.param("slow 0.3", RobotTimeout, marks=pytest.mark.qualify),
     ],
 )
-def test_in_mid_move(controller: FakeUr, robot: UrRobot, fault: str, kind: type[RobotError]) -> None:
+def test_in_mid_move(controller: FakeUr, robot: UrRobot, fault: str, kind: type[RobotError] | tuple[type[RobotError], ...]) -> None:
     """The next reading fails in time; the motion is at its end soon after, by our stop or by the controller's watchdog."""
     under_way(robot)
     count = controller.n_motions()
     controller.fault(fault)
     with in_time(2 * SILENCE_S):
-        first_error(robot.read_state, kind)
+        first_error(robot.read_state, *(kind if isinstance(kind, tuple) else (kind,)))
     with in_time(2 * SILENCE_S):
         told: list[str] = []
         try:
