@@ -31,7 +31,7 @@ FALSE_ALARM = 0.0125
 """Chance of an alarm where nothing changed, all tests together."""
 _ALIKE_SIGMAS, _GENEROUS = 1.5, 8.0
 """A cause that can imitate another to within so much, by sizes of up to so many times the usual ones, is told beside it."""
-_SHARE = 0.05
+_SHARE = 0.025
 """Part of that for each test that names nothing: of all residuals, of axis 1, the last axis, spheres and single shots."""
 _SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0)
 """Factors on the usual size of a cause."""
@@ -201,18 +201,17 @@ class Diagnosis:
 
 def diagnose(residuals: CheckResiduals, causes: Sequence[Cause]) -> Diagnosis:
     """Test for a change, and weigh every cause."""
-    factor: FloatArray = np.asarray(np.linalg.cholesky(residuals.covariance_mm2), dtype=np.float64)
-    y: FloatArray = np.asarray(np.linalg.solve(factor, residuals.residual_mm.reshape(-1)), dtype=np.float64)
+    factor, y = whitened(residuals)
     total, freedom = float(y @ y), len(y)
     shares = _shares(causes, factor)
     noise_freedom = residuals.noise_freedom
-    p_values = [_chance(total, freedom, noise_freedom) / _SHARE]
+    p_values = [chance(total, freedom, noise_freedom) / _SHARE]
     weighed = []
     for cause, share in zip(causes, shares, strict=True):
-        shapes = [_weigh(shape, factor, y) for shape in cause.shapes]
+        shapes = [weigh(shape, factor, y) for shape in cause.shapes]
         best = max(range(len(shapes)), key=lambda i: shapes[i][0])
         evidence = float(logsumexp([s[0] for s in shapes], b=np.array([shape.weight for shape in cause.shapes]) / len(cause.shapes)))
-        p_values.append(min(_chance(explained, k, noise_freedom) for _, explained, k, _ in shapes) * len(shapes) / share)
+        p_values.append(min(chance(explained, k, noise_freedom) for _, explained, k, _ in shapes) * len(shapes) / share)
         weighed.append((cause, evidence + np.log(cause.prior), shapes[best], shapes[0][3]))
     log_total = float(logsumexp([evidence for _, evidence, _, _ in weighed]))
     explanations = [
@@ -223,6 +222,12 @@ def diagnose(residuals: CheckResiduals, causes: Sequence[Cause]) -> Diagnosis:
     alike = _alike(explanations[0], causes, factor)
     prior = sum(cause.prior for cause in causes)
     return Diagnosis(total, freedom, float(min(1.0, *p_values)), log_total - float(np.log(prior)), tuple(explanations), alike)
+
+
+def whitened(residuals: CheckResiduals) -> tuple[FloatArray, FloatArray]:
+    """Cholesky factor (3 m, 3 m) of the covariance where nothing changed, and the residuals (3 m,) in units of it."""
+    factor: FloatArray = np.asarray(np.linalg.cholesky(residuals.covariance_mm2), dtype=np.float64)
+    return factor, np.asarray(np.linalg.solve(factor, residuals.residual_mm.reshape(-1)), dtype=np.float64)
 
 
 def named(diagnosis: Diagnosis, n_axes: int) -> tuple[str, ...]:
@@ -258,7 +263,7 @@ def _alike(likeliest: Explanation, causes: Sequence[Cause], factor: FloatArray) 
     return tuple(found)
 
 
-def _chance(chi_square: float, freedom: int, noise_freedom: float) -> float:
+def chance(chi_square: float, freedom: int, noise_freedom: float) -> float:
     """Of so large a chi-square by noise alone, where the size of the noise is itself an estimate."""
     return float(f_distribution.sf(chi_square / freedom, freedom, noise_freedom))
 
@@ -277,7 +282,7 @@ def _shares(causes: Sequence[Cause], factor: FloatArray) -> FloatArray:
     return shares
 
 
-def _weigh(shape: Shape, factor: FloatArray, y: FloatArray) -> tuple[float, float, int, dict[str, tuple[float, float]]]:
+def weigh(shape: Shape, factor: FloatArray, y: FloatArray) -> tuple[float, float, int, dict[str, tuple[float, float]]]:
     """Log evidence against no change, chi-square explained, its freedom, amplitudes."""
     columns: FloatArray = np.asarray(np.linalg.solve(factor, shape.scaled), dtype=np.float64)
     u, s, vt = np.linalg.svd(columns, full_matrices=False)

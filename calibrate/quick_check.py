@@ -9,7 +9,7 @@ motion of the residuals per unknown, and the noise of points and poses that the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from drivers.kinematics.se3 import FloatArray
 
 _SMALLEST_RADIUS_SIGMA_MM = 1e-5
 _LEAST_FREEDOM = 5
+SAME_POSE_RAD = 0.01
+"""Axis angles nearer than this on every axis are the same pose, planned once and driven to again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +129,36 @@ def check_residuals(calibration: Calibration, shots: Sequence[SphereShot]) -> Ch
     statistics = calibration.statistics
     freedom = float(max(3 * statistics.used - statistics.rank, _LEAST_FREEDOM))
     return CheckResiduals(problem, geometry, residual, covariance, sensitivity, freedom)
+
+
+def changes_since(calibration: Calibration, earlier: Sequence[SphereShot], shots: Sequence[SphereShot]) -> CheckResiduals | None:
+    """Residuals of shots less those of earlier shots of the same spheres from the same poses; None where no two match.
+
+    What the calibration leaves at a pose is in both and drops out, its covariance with it: little more than pose noise
+    remains, so that smaller changes show, and an uncertainty that the calibration claims too small raises no alarm.
+    """
+    matched = [(old, new) for new in shots for old in _same_view(new, earlier)[:1]]
+    if not matched:
+        return None
+    now = [new for _, new in matched]
+    both = check_residuals(calibration, [old for old, _ in matched] + now)
+    m = len(matched)
+    less = np.concatenate([-np.eye(3 * m), np.eye(3 * m)], axis=1)
+    covariance = less @ both.covariance_mm2 @ less.T
+    residual = both.residual_mm[m:] - both.residual_mm[:m]
+    return replace(check_residuals(calibration, now), residual_mm=residual, covariance_mm2=np.asarray((covariance + covariance.T) / 2))
+
+
+def _same_view(shot: SphereShot, earlier: Sequence[SphereShot]) -> list[SphereShot]:
+    """Earlier shots of its sphere from its pose, the nearest first."""
+    if shot.joints_rad is None:
+        return []
+    off = [
+        (float(np.abs(old.joints_rad - shot.joints_rad).max()), old.key, old)
+        for old in earlier
+        if old.sphere == shot.sphere and old.joints_rad is not None
+    ]
+    return [old for distance, _, old in sorted(off, key=lambda found: found[:2]) if distance < SAME_POSE_RAD]
 
 
 def null_covariance_mm2(

@@ -31,6 +31,9 @@ def check(
         str | None, typer.Option("--cause", help="What to solve anew: hand-eye, 'axis N' or 'sphere moved'; what was named if left out.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The new calibration, with --resolve.")] = Path("resolved.yaml"),
+    since: Annotated[
+        Path | None, typer.Option("--since", help="Session of an earlier check at the same poses: what has changed between the two is told too.")
+    ] = None,
     history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -44,7 +47,7 @@ def check(
         from measure.quick.check import check as check_sessions
 
         loaded, place = Calibration.load(calibration), place_of(history, calibration)
-        result = check_sessions(loaded, [read_session(folder) for folder in sessions])
+        result = check_sessions(loaded, [read_session(folder) for folder in sessions], None if since is None else read_session(since))
         told = result.to_json_dict()
         _tell(run.console, result)
         kept = record_result(place, "check", loaded, calibration, told, run.console.note, taken_utc=result.taken_utc)

@@ -11,6 +11,7 @@ import numpy as np
 from acquire.cell import Cell, cell_of_session, robot_model_of
 from calibrate.check_design import clarity
 from calibrate.drift_causes import CAMERA, HAND_EYE, SHOT, SPHERE, Diagnosis, causes_of, diagnose, named
+from calibrate.drift_pairs import Together, two_causes
 from calibrate.observations import Observations, RejectedShot, SphereShot
 from calibrate.quick_check import CheckResiduals, check_residuals, known_state
 from calibrate.result import Calibration
@@ -20,6 +21,7 @@ from drivers.errors import DataError
 from drivers.files.session import Session
 from measure.decision import Verdict
 from measure.placing import check_fits
+from measure.quick.since import SinceEarlier, since_earlier, together_json, told_causes
 from measure.verify import verify_observations
 from measure.verify_result import SessionName, VerifyResult
 
@@ -69,6 +71,10 @@ class CheckResult:
     verdict: Verdict
     reasons: tuple[str, ...]
     seconds: float
+    together: Together | None = None
+    """More than one thing that changed (`named` is then at best one of them); None where one cause explains the shots well enough."""
+    since: SinceEarlier | None = None
+    """Against an earlier check; None where none was given."""
     taken_utc: str | None = None
     """When its last shot was taken."""
     sphere_shots: tuple[SphereShot, ...] = field(default=(), repr=False)
@@ -84,6 +90,8 @@ class CheckResult:
             "reasons": list(self.reasons),
             "changed": self.diagnosis.changed,
             "named": list(self.named),
+            "together": together_json(self.together),
+            "since": None if self.since is None else self.since.to_json_dict(),
             "p_value": self.diagnosis.p_value,
             "chi_square": self.diagnosis.chi_square,
             "freedom": self.diagnosis.freedom,
@@ -110,23 +118,22 @@ class CheckResult:
         }
 
 
-def check(calibration: Calibration, sessions: Sequence[Session]) -> CheckResult:
+def check(calibration: Calibration, sessions: Sequence[Session], since: Session | None = None) -> CheckResult:
     """Compare a few shots with their calibration.
 
     Args:
         calibration: of the spheres that the shots show.
         sessions: at least one.
+        since: an earlier check at the same poses, to compare with.
 
     Raises:
-        DataError: no shot shows a sphere, one that the calibration has not seen, its own shots, or a line profile.
+        DataError: no shot shows a sphere or repeats a pose of the earlier check; a sphere that the calibration has not seen, its own
+            shots, or a line profile.
         FileError: a session is broken.
     """
     began = time.perf_counter()
     cells = [cell_of_session(session) for session in sessions]
-    for session, cell in zip(sessions, cells, strict=True):
-        check_fits(calibration, session, cell)
-    _refuse_training(calibration, sessions)
-    seen = [see_sessions([s], cell=c, model=robot_model_of(c, s)) for s, c in zip(sessions, cells, strict=True)]
+    seen = [_seen(calibration, session, cell) for session, cell in zip(sessions, cells, strict=True)]
     rejected = tuple(shot for part in seen for shot in part.rejected)
     shots = sorted((shot for part in seen for shot in part.shots), key=lambda shot: shot.key)
     if not shots:
@@ -135,6 +142,9 @@ def check(calibration: Calibration, sessions: Sequence[Session]) -> CheckResult:
     artefact = artefact_when_seen({n: s for c in cells for n, s in c.spheres.items()}, list(cells[0].lengths), sessions)
     cell = cells[0].model_copy(update={"spheres": artefact.spheres, "lengths": artefact.lengths})
     result = check_shots(calibration, shots, rejected, cell)
+    if since is not None:
+        earlier = _seen(calibration, since, cell_of_session(since)).shots
+        result = _with_since(result, since_earlier(calibration, since.folder.name, earlier, shots))
     named_sessions = tuple(SessionName(session.folder.name, session.digest) for session in sessions)
     return replace(result, figures=replace(result.figures, sessions=named_sessions), seconds=time.perf_counter() - began)
 
@@ -145,8 +155,9 @@ def check_shots(calibration: Calibration, shots: Sequence[SphereShot], rejected:
     causes = causes_of(residuals, known_state(calibration, residuals.problem.n_scans), tuple(calibration.sphere_centres_in_base_mm))
     diagnosis = diagnose(residuals, causes)
     told = named(diagnosis, 0 if calibration.model is None else calibration.model.n_joints)
+    together = two_causes(residuals, causes, diagnosis)
     clear = clarity(residuals, causes)
-    verdict, reasons = _judged(diagnosis, told, clear, len(shots))
+    verdict, reasons = _judged(diagnosis, told, together, clear, len(shots))
     figures = verify_observations(calibration, Observations(tuple(shots), tuple(rejected)), cell, limits=calibration.limits)
     times = [shot.time_utc for shot in shots if shot.time_utc is not None]
     return CheckResult(
@@ -161,17 +172,33 @@ def check_shots(calibration: Calibration, shots: Sequence[SphereShot], rejected:
         verdict=verdict,
         reasons=reasons,
         seconds=0.0,
+        together=together,
         taken_utc=max(times) if times else None,
         sphere_shots=tuple(shots),
     )
 
 
-def _judged(diagnosis: Diagnosis, told: tuple[str, ...], clear: Mapping[str, tuple[float, float]], n_shots: int) -> tuple[Verdict, tuple[str, ...]]:
+def _seen(calibration: Calibration, session: Session, cell: Cell) -> Observations:
+    check_fits(calibration, session, cell)
+    _refuse_training(calibration, [session])
+    return see_sessions([session], cell=cell, model=robot_model_of(cell, session))
+
+
+def _with_since(result: CheckResult, since: SinceEarlier) -> CheckResult:
+    """A change since an earlier check is one, even where the calibration's own uncertainty hides it."""
+    changed = since.diagnosis.changed
+    remedy = (advice(since.named),) if changed and not result.diagnosis.changed else ()
+    return replace(result, since=since, verdict="reject" if changed else result.verdict, reasons=(*result.reasons, since.reason, *remedy))
+
+
+def _judged(
+    diagnosis: Diagnosis, told: tuple[str, ...], together: Together | None, clear: Mapping[str, tuple[float, float]], n_shots: int
+) -> tuple[Verdict, tuple[str, ...]]:
     if diagnosis.changed:
         likeliest = diagnosis.explanations[0]
-        what = f"changed since the calibration: {' or '.join(told)}"
-        if len(told) > 1:
-            what += " (these shots cannot tell which)"
+        what = f"changed since the calibration: {told_causes(told, together)}"
+        if together is not None:
+            return "reject", (what, *dict.fromkeys(advice((name,)) for name in together.pairs[0].causes))
         sizes = ", ".join(_amount(name, value, sigma) for name, (value, sigma) in likeliest.amplitudes.items())
         return "reject", (what, f"by {sizes}", advice(told))
     blind = [name for name, (seen, _) in clear.items() if seen < LEAST_CLARITY]

@@ -28,6 +28,10 @@ def _the_cause(result: CheckResult) -> str:
     told = result.named
     if not told:
         raise DataError("nothing has changed that a check could show, so that there is nothing to solve anew", remedy="Keep the calibration.")
+    if result.together is not None:
+        likeliest = "' or --cause '".join(result.together.pairs[0].causes)
+        message = "more than one thing has changed, and a check solves one at a time"
+        raise DataError(message, remedy=f"Calibrate anew; or put one of them right, check again, or choose: --cause '{likeliest}'.")
     if len(told) == 1:
         return told[0]
     if HAND_EYE in told and SPHERE not in told and len(told) == 2 and told[0] != HAND_EYE and _is_last_axis(told, result):

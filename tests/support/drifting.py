@@ -94,6 +94,12 @@ def planned_check(
     return CheckedCell(seed, volume, calibration, together[design.rows], tuple(spheres[i] for i in design.rows), design, together)
 
 
+def after_two(checked: CheckedCell, causes: tuple[str, str], rng: np.random.Generator, *, size: float = 1.0) -> list[SphereShot]:
+    """The shots of a check after two changes; a camera that bends is not one of them."""
+    volume = changed(changed(checked.volume, causes[0], rng, size), causes[1], rng, size)
+    return check_shots(replace(checked, volume=volume), None, rng)
+
+
 def check_shots(checked: CheckedCell, cause: str | None, rng: np.random.Generator, *, size: float = 1.0) -> list[SphereShot]:
     """The shots of a check after a change; `size` is a factor on the sizes of the issue.
 

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from calibrate.check_design import clarity, ideal_shots
-from calibrate.drift_causes import HAND_EYE, SPHERE, causes_of, named
+from calibrate.drift_causes import HAND_EYE, SPHERE, Cause, Diagnosis, causes_of, diagnose, named
+from calibrate.drift_pairs import two_causes
 from calibrate.few_parameters import resolve
 from calibrate.observations import SphereShot
-from calibrate.quick_check import check_residuals, known_state
+from calibrate.quick_check import CheckResiduals, changes_since, check_residuals, known_state
 from calibrate.result import Calibration
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
-from tests.support.drifting import CheckedCell, check_shots, diagnosis_of, small_checked_cell
+from measure.quick.since import since_earlier
+from tests.support.drifting import CheckedCell, after_two, check_shots, diagnosis_of, small_checked_cell
 from tests.support.volume import DIAMETER_MM
 
 SEED = 61_001
@@ -90,6 +92,48 @@ def test_one_spoiled_shot_is_told_as_that(checked: CheckedCell) -> None:
     shots = shots_after(checked, None, seed=6)
     shots[3] = replace(shots[3], points_in_camera_mm=shots[3].points_in_camera_mm + np.array([0.0, 0.9, 0.0]))
     assert named(diagnosis_of(checked, shots), N_AXES) == ("single shot",)
+
+
+def test_two_changes_at_once_are_told_as_two(checked: CheckedCell) -> None:
+    causes = ("axis 3", SPHERE)
+    found, residuals, all_causes = diagnosed(checked, after_two(checked, causes, np.random.default_rng([SEED, 8]), size=4.0))
+    together = two_causes(residuals, all_causes, found)
+    assert together is not None
+    assert together.log_odds > np.log(1e4)
+    assert {*together.pairs[0].causes} == {*causes}
+    assert sum(pair.probability for pair in together.pairs) <= 1.0
+    for cause in (None, "axis 3", "hand-eye", SPHERE):
+        found, residuals, all_causes = diagnosed(checked, shots_after(checked, cause, size=2.0, seed=9))
+        assert two_causes(residuals, all_causes, found) is None, cause
+
+
+def diagnosed(checked: CheckedCell, shots: list[SphereShot]) -> tuple[Diagnosis, CheckResiduals, tuple[Cause, ...]]:
+    residuals = check_residuals(checked.calibration, shots)
+    state = known_state(checked.calibration, residuals.problem.n_scans)
+    causes = causes_of(residuals, state, tuple(checked.calibration.sphere_centres_in_base_mm))
+    return diagnose(residuals, causes), residuals, causes
+
+
+def test_an_earlier_check_takes_out_what_the_calibration_leaves(checked: CheckedCell) -> None:
+    """A calibration that is wrong, and sure of itself, alarms at once; against an earlier check only what changed in between shows."""
+    wrong = replace(checked.calibration, flange_from_camera=checked.calibration.flange_from_camera @ se3.exp(np.array([0.4, -0.3, 0.2, 0, 0, 0])))
+    of_wrong = replace(checked, calibration=wrong)
+    earlier = [replace(shot, session="earlier") for shot in shots_after(checked, None, seed=10)]
+    assert diagnosis_of(of_wrong, earlier).changed
+    names = []
+    for cause, size in ((None, 1.0), ("axis 3", 2.0)):
+        since = since_earlier(wrong, "earlier", earlier[::-1], shots_after(checked, cause, size=size, seed=11))
+        assert since.n_matched == 8
+        names.append(since.named)
+    assert names == [(), ("axis 3",)]
+    # the two have the noise of poses and points twice, and nothing of the calibration
+    residuals = changes_since(wrong, earlier, shots_after(checked, None, seed=12))
+    assert residuals is not None
+    sure = changes_since(replace(wrong, covariance=1e-12 * wrong.covariance), earlier, shots_after(checked, None, seed=12))
+    assert sure is not None
+    np.testing.assert_allclose(residuals.covariance_mm2, sure.covariance_mm2, atol=1e-6)
+    with pytest.raises(DataError, match="3 of 8 shots repeat a pose"):
+        since_earlier(wrong, "earlier", earlier[:3], shots_after(checked, None, seed=12))
 
 
 def test_a_sphere_that_the_calibration_never_saw_is_refused(checked: CheckedCell) -> None:

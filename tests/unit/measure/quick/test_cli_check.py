@@ -16,7 +16,7 @@ from calibrate.result_file import calibration_data
 from measure.cli import app
 from measure.cli_run import run_app
 from measure.quick import planning
-from tests.support.drifting import CheckedCell, check_shots, small_checked_cell, write_check_session
+from tests.support.drifting import CheckedCell, after_two, check_shots, small_checked_cell, write_check_session
 
 RULED_S = 180.0
 
@@ -100,6 +100,23 @@ def test_the_field_between_two_calibrations_shows_what_was_moved(folder: Path, c
     itself = told(capfd, "diff", str(folder / "calibration.yaml"), str(folder / "calibration.yaml"))
     assert itself["max_mm"] == 0.0
     assert itself["within_u"] == 1.0
+
+
+def test_a_check_is_held_against_an_earlier_one_and_two_changes_are_not_solved_as_one(
+    folder: Path, checked: CheckedCell, capfd: pytest.CaptureFixture[str]
+) -> None:
+    calibration, earlier = str(folder / "calibration.yaml"), session(folder, checked, None, 20)
+    found = told(capfd, "check", calibration, session(folder, checked, None, 21), "--since", earlier)
+    assert (found["verdict"], found["since"]["earlier"], found["since"]["n_matched"], found["since"]["changed"]) == ("conform", "session20", 8, False)
+    found = told(capfd, "check", calibration, session(folder, checked, "axis 3", 22), "--since", earlier, code=3)
+    assert (found["since"]["named"], found["together"]) == (["axis 3"], None)
+    assert any(reason.startswith("changed since the check session20: axis 3") for reason in found["reasons"])
+    shots = after_two(checked, ("axis 3", "sphere moved"), np.random.default_rng([61, 23]), size=4.0)
+    both = str(write_check_session(folder / "both", checked, shots))
+    found = told(capfd, "check", calibration, both, code=3)
+    assert sorted(found["together"]["pairs"][0]["causes"]) == ["axis 3", "sphere moved"]
+    assert "more than one thing" in found["reasons"][0]
+    assert "more than one thing" in told(capfd, "check", calibration, both, "--resolve", code=1)["error"]["message"]
 
 
 def shifted(by_mm: float) -> Any:
