@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,12 +51,12 @@ def inspect(
         part = None
         if sources is not None and sources.stitches:
             part = _measured_part(run.console, sources, drawing, out, 0.5 if voxel is None else voxel)
-            measured, result = part.cloud, part.inspection
+            result, whole = part.inspection, part.cloud
         else:
-            measured, result = _inspected(cloud, sources, drawing)
+            result, whole = _inspected(cloud, sources, drawing)
         tell_inspection(run.console, result)
         if not no_map:
-            result = with_deviations(result, measured, drawing.nominal, drawing.spec)
+            result = with_deviations(result, whole(), drawing.nominal, drawing.spec)
             tell_deviations(run.console, result)
         write_outputs(out, result, recording=not no_recording, add=None if part is None else part.write_cloud)
         run.console.say(f"{out / 'inspection.html'} written")
@@ -144,8 +144,8 @@ def _measured_part(console: Console, sources: _Sources, drawing: Drawing, out: P
     return part
 
 
-def _inspected(cloud: Path, sources: _Sources | None, drawing: Drawing) -> tuple[MeasuredCloud, Inspection]:
-    """A cloud that somebody stitched, judged.
+def _inspected(cloud: Path, sources: _Sources | None, drawing: Drawing) -> tuple[Inspection, Callable[[], MeasuredCloud]]:
+    """The verdict on a cloud that somebody stitched, and what gives that cloud.
 
     Raises:
         SettingsError: another calibration than the cloud's.
@@ -172,7 +172,7 @@ def _inspected(cloud: Path, sources: _Sources | None, drawing: Drawing) -> tuple
         correlation=drawing.correlation,
         judge_corrected=drawing.judge_corrected,
     )
-    return measured, found
+    return found, lambda: measured
 
 
 def _kept(console: Console, sources: _Sources | None, history: str | None, told: Mapping[str, object]) -> dict[str, object]:

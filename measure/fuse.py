@@ -252,21 +252,26 @@ class VoxelGrid:
                 part.make_room(part.n_rows + len(rows))
                 part.n_rows = kernels.absorb(part.index, part.rows, part.rows.view(np.int32), part.n_rows, rows, rows.view(np.int32))
 
-    def fused(self, *, min_count: int = 1) -> FusedCloud:
-        """The cloud so far, in memory; voxels with fewer than `min_count` points are left out."""
-        return FusedCloud.joined(list(self.pieces(min_count=min_count)), self.voxel_mm)
+    def fused(self, *, min_count: int = 1, box_mm: FloatArray | None = None) -> FusedCloud:
+        """The cloud so far, in memory; voxels with fewer than `min_count` points are left out.
+
+        Of a box (2, 3) the voxels that touch it, as they stand in the whole cloud.
+        """
+        return FusedCloud.joined(list(self.pieces(min_count=min_count, box_mm=box_mm)), self.voxel_mm)
 
     def n_fused(self, *, min_count: int = 1) -> int:
         """Number of points that `fused` has."""
         from measure import fuse_kernels as kernels
 
+        if min_count <= 1:
+            return self.n_voxels
         return sum(int((rows.view(np.int32)[:, kernels.COUNT] >= min_count).sum()) for rows in self._unsorted())
 
-    def pieces(self, *, min_count: int = 1) -> Iterator[FusedCloud]:
-        """The cloud so far, piece by piece in order; the grid must not be filled meanwhile."""
+    def pieces(self, *, min_count: int = 1, box_mm: FloatArray | None = None) -> Iterator[FusedCloud]:
+        """The cloud so far, piece by piece in order; the grid must not be filled meanwhile. For `box_mm` see `fused`."""
         from measure import fuse_kernels as kernels
 
-        for rows in self._sorted():
+        for rows in self._sorted() if box_mm is None else self._sorted_in(box_mm):
             kept = rows if min_count <= 1 else rows[rows.view(np.int32)[:, kernels.COUNT] >= min_count]
             if len(kept):
                 yield self._summarised(kept)
@@ -276,6 +281,24 @@ class VoxelGrid:
 
     def _sorted(self) -> Iterator[IntArray]:
         return self._settled_tiles().pieces(PIECE) if self._tiles.n_runs else self._sorted_parts()
+
+    def _sorted_in(self, box_mm: FloatArray) -> Iterator[IntArray]:
+        """The rows of a box, in order, none of the others put in order or copied."""
+        from measure import fuse_kernels as kernels
+
+        low, high = (np.clip(np.floor(corner / self.voxel_mm), -kernels.HALF_RANGE, kernels.HALF_RANGE) for corner in np.asarray(box_mm))
+
+        def inside(rows: IntArray) -> IntArray:
+            chosen = np.arange(len(rows))
+            for axis in range(3):
+                at = kernels.voxel_index(rows[chosen, kernels.KEY], axis)
+                chosen = chosen[(at >= low[axis]) & (at <= high[axis])]
+            return rows[chosen]
+
+        found = [inside(rows) for rows in self._unsorted()]
+        together = np.concatenate(found) if found else np.empty((0, self._words), dtype=np.int64)
+        together = together[np.argsort(together[:, kernels.KEY], kind="stable")]
+        return (together[first : first + PIECE] for first in range(0, len(together), PIECE))
 
     def _sorted_parts(self) -> Iterator[IntArray]:
         from measure import fuse_kernels as kernels

@@ -258,6 +258,11 @@ def sum_equal_keys(rows: IntArray, halves: NDArray[np.int32]) -> int:
     return n_left
 
 
+def voxel_index(keys: IntArray, axis: int) -> IntArray:
+    """(n,) index along an axis of the voxels with some keys (n,)."""
+    return ((keys >> (INDEX_BITS * (2 - axis))) & ((1 << INDEX_BITS) - 1)) - HALF_RANGE
+
+
 @compiled
 def means(rows: IntArray, halves: NDArray[np.int32], voxel_mm: float, points_mm: FloatArray) -> None:
     """Weighted mean point (n, 3) of rows (n, words)."""

@@ -14,11 +14,12 @@ from pathlib import Path
 
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, Shot
-from measure.fuse import FusedCloud
+from measure.fuse import VoxelGrid
 from measure.gauge.correlation import Correlation
-from measure.inspecting.cloud import MeasuredCloud, cloud_of
+from measure.inspecting.cloud import FEWEST_POINTS, MeasuredCloud, cloud_of
 from measure.inspecting.inspection import inspect_cloud
 from measure.inspecting.nominal import Nominal
+from measure.inspecting.region import region_of
 from measure.inspecting.result import Inspection
 from measure.inspecting.spec import InspectionSpec
 from measure.inspecting.views import View, field_of, view_of
@@ -46,10 +47,14 @@ class MeasuredPart:
     """A part's cloud, not written yet, and its verdict."""
 
     inspection: Inspection
-    cloud: MeasuredCloud
     stitched: StitchResult
-    fused: FusedCloud
+    grid: VoxelGrid
+    min_count: int
     label: CloudLabel
+
+    def cloud(self) -> MeasuredCloud:
+        """All of it, as `load_cloud` reads what `write_cloud` writes: for a map of deviations."""
+        return cloud_of(as_written(self.grid.fused(min_count=self.min_count), self.label), self.stitched.out)
 
     def write_cloud(self, folder: Path) -> None:
         """Write the cloud into a folder.
@@ -57,7 +62,7 @@ class MeasuredPart:
         Raises:
             FileError: it cannot be written.
         """
-        write_cloud(folder / CLOUD_FILE, [self.fused], self.stitched.n_points, self.label)
+        write_cloud(folder / CLOUD_FILE, self.grid.pieces(min_count=self.min_count), self.stitched.n_points, self.label)
 
 
 class PartInProgress:
@@ -139,15 +144,39 @@ class PartInProgress:
         if self._stitcher is None:  # catch_up raises where there is no scan
             raise RuntimeError
         grid, settings = self._stitcher.grid, self._settings
-        fused = grid.fused(min_count=settings.min_count)
         counts = sum((self._counts[index] for index in sorted(self._counts)), ScanCounts())
-        require_points(len(fused.count), session, counts)
+        n_points = grid.n_fused(min_count=settings.min_count)
+        require_points(n_points, session, counts)
+        stitched = StitchResult(
+            out=folder / CLOUD_FILE,
+            n_scans=len(self._counts),
+            counts=counts,
+            n_points=n_points,
+            n_tiles=grid.n_tiles,
+            voxel_mm=grid.voxel_mm,
+            calibration_id=self._calibration.id,
+            session_digest=session.digest,
+            seconds=time.perf_counter() - began,
+            marks=self._marks,
+        )
         label = cloud_label(self._calibration, session, settings, len(self._counts))
-        out = folder / CLOUD_FILE
-        measured = cloud_of(as_written(fused, label), out)
-        stitched_s = time.perf_counter() - began
+        part = MeasuredPart(self._inspected_near(drawing, grid, label, stitched), stitched, grid, settings.min_count, label)
+        return replace(part, inspection=replace(part.inspection, seconds_to_verdict=time.perf_counter() - began))
+
+    def _inspected_near(self, drawing: Drawing, grid: VoxelGrid, label: CloudLabel, stitched: StitchResult) -> Inspection:
+        """Judged by the points that the inspection can look at; by all where the part turns out to stand elsewhere."""
+        region = region_of(drawing.spec, drawing.nominal)
+        if region is not None:
+            fused = grid.fused(min_count=self._settings.min_count, box_mm=region.in_base_mm)
+            if len(fused.count) >= FEWEST_POINTS:
+                found = self._inspected(drawing, cloud_of(as_written(fused, label), stitched.out))
+                if region.holds(found.alignment.part_from_base):
+                    return _of_whole_cloud(found, stitched.n_points)
+        return self._inspected(drawing, cloud_of(as_written(grid.fused(min_count=self._settings.min_count), label), stitched.out))
+
+    def _inspected(self, drawing: Drawing, measured: MeasuredCloud) -> Inspection:
         views = [self._views[index] for index in sorted(self._views)]
-        found = inspect_cloud(
+        return inspect_cloud(
             measured,
             drawing.nominal,
             drawing.spec,
@@ -156,20 +185,14 @@ class PartInProgress:
             correlation=drawing.correlation,
             judge_corrected=drawing.judge_corrected,
         )
-        stitched = StitchResult(
-            out=out,
-            n_scans=len(self._counts),
-            counts=counts,
-            n_points=len(fused.count),
-            n_tiles=grid.n_tiles,
-            voxel_mm=grid.voxel_mm,
-            calibration_id=self._calibration.id,
-            session_digest=session.digest,
-            seconds=stitched_s,
-            marks=self._marks,
-        )
-        found = replace(found, seconds_to_verdict=time.perf_counter() - began)
-        return MeasuredPart(found, measured, stitched, fused, label)
+
+
+def _of_whole_cloud(found: Inspection, n_points: int) -> Inspection:
+    """With the counts of the cloud that its points come from."""
+    deviations, n_beside = found.deviations, n_points - found.n_points
+    if deviations is not None:
+        deviations = replace(deviations, n_left_out=deviations.n_left_out + n_beside)
+    return replace(found, n_points=n_points, deviations=deviations)
 
 
 def measure_part(

@@ -140,7 +140,7 @@ class PartLine:
         self.say(f"part {number}: {verdict.replace('_', ' ')}: {reason}")
 
     def _write(self, session: Session, measured: MeasuredPart, folder: Path) -> None:
-        found = with_deviations(measured.inspection, measured.cloud, self.drawing.nominal, self.drawing.spec)
+        found = with_deviations(measured.inspection, measured.cloud(), self.drawing.nominal, self.drawing.spec)
         self.places.results.mkdir(parents=True, exist_ok=True)
         write_outputs(folder, found, recording=False, add=measured.write_cloud)
         content: Mapping[str, object] = {"part": folder.name, **found.to_json_dict(), "out": str(folder)}

@@ -91,7 +91,7 @@ def fit_feature(name: str, feature: Feature, cloud: PartCloud, others: Mapping[s
 
 def points_near(shape: Shape, cloud: PartCloud) -> IntArray:
     """Rows of the cloud in a shape's region, whose normals agree where they are known."""
-    low, high = _box(shape)
+    low, high = box_of(shape)
     points = cloud.points_mm
     rows = np.flatnonzero((points[:, 0] > low[0]) & (points[:, 0] < high[0]))
     for axis in (1, 2):
@@ -111,7 +111,8 @@ def _subset(kept: NDArray[np.bool_], rows: IntArray, local: FloatArray) -> tuple
     return rows[kept], local[kept]
 
 
-def _box(shape: Shape) -> tuple[FloatArray, FloatArray]:
+def box_of(shape: Shape) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper corner (3,), in the frame of the part, of the box round a shape's region."""
     part_from_local = se3.inverse(shape.local_from_part)
     half = np.abs(part_from_local[:3, :3]) @ shape.reach_mm
     return part_from_local[:3, 3] - half, part_from_local[:3, 3] + half

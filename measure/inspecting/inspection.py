@@ -22,13 +22,13 @@ from measure.inspecting.geometry import element_of, nominal_element
 from measure.inspecting.judging import Judging, check_result, feature_result, verdict_of
 from measure.inspecting.nominal import Nominal
 from measure.inspecting.quantities import Model, require_checks_fit
+from measure.inspecting.region import WIDER
 from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, Inspection
 from measure.inspecting.spec import InspectionSpec, ProfileCheck
 from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance
 from measure.inspecting.views import FieldSource
 
 _DATUM_ROUNDS = 3
-_WIDER = 3.0
 _FEWEST_OF_PART = 100
 
 
@@ -167,7 +167,7 @@ def _align(cloud: MeasuredCloud, spec: InspectionSpec, surface: NominalSurface |
         return _Aligned(placed.moved(fitted.new_from_part), fitted.new_from_part @ part_from_base, fitted)
     if spec.alignment.method == "datums":
         for number in range(_DATUM_ROUNDS):
-            moved = _datum_step(spec, placed, _WIDER if number == 0 else 1.0)
+            moved = _datum_step(spec, placed, WIDER if number == 0 else 1.0)
             placed, part_from_base = placed.moved(moved), moved @ part_from_base
     return _Aligned(placed, part_from_base)
 
@@ -239,19 +239,24 @@ def _covariances(
 
 def _deviations(cloud: MeasuredCloud, surface: NominalSurface, part_from_base: FloatArray, spec: InspectionSpec) -> DeviationMap:
     points = se3.apply(part_from_base, cloud.points_mm)
-    near = surface.nearest(points)
+    reach_mm = spec.deviation_limit_mm + abs(spec.surface.offset_mm) + 1e-6
+    low, high = surface.nominal.box_mm
+    # what lies outside of this box is farther from the mesh than the limit: a table costs nothing
+    rows = np.flatnonzero(((points >= low - reach_mm) & (points <= high + reach_mm)).all(axis=1))
+    near = surface.nearest(points[rows])
     signed = near.signed_mm - spec.surface.offset_mm
-    kept = (np.abs(signed) <= spec.deviation_limit_mm) & ~near.at_border
-    if kept.sum() < _FEWEST_OF_PART:
+    among = (np.abs(signed) <= spec.deviation_limit_mm) & ~near.at_border
+    kept = rows[among]
+    if len(kept) < _FEWEST_OF_PART:
         raise DataError(
-            f"{int(kept.sum())} of {len(points)} points lie within {spec.deviation_limit_mm:g} mm of the nominal",
+            f"{len(kept)} of {len(points)} points lie within {spec.deviation_limit_mm:g} mm of the nominal",
             file=cloud.file,
             remedy="Give alignment.base_from_part, or align by best_fit or datums; see that cloud and nominal are of one part, in mm.",
         )
-    normal = near.normal[kept].mean(axis=0)
+    normal = near.normal[among].mean(axis=0)
     length = float(np.linalg.norm(normal))
     facing = normal / length if length > 0.05 else np.array([0.0, 0.0, 1.0])  # seen from all sides
-    return DeviationMap(points[kept], cloud.points_mm[kept], signed[kept], int((~kept).sum()), spec.deviation_limit_mm, facing)
+    return DeviationMap(points[kept], cloud.points_mm[kept], signed[among], len(points) - len(kept), spec.deviation_limit_mm, facing)
 
 
 def _alignment_result(spec: InspectionSpec, aligned: _Aligned, model: Model, covariance: JointCovariance) -> AlignmentResult:

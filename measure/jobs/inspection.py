@@ -46,7 +46,7 @@ def inspect_part(
     # the place of an attempt means nothing to anybody later
     part = measure_part(calibration, session, drawing, Path(), settings, spill_folder=working)
     part.write_cloud(working)
-    found = with_deviations(part.inspection, part.cloud, drawing.nominal, drawing.spec)
+    found = with_deviations(part.inspection, part.cloud(), drawing.nominal, drawing.spec)
     write_outputs(working / FOLDER, found, recording=False)
     return part.stitched, {**found.to_json_dict(), "out": FOLDER}
 

@@ -266,3 +266,19 @@ def test_a_memory_budget_must_be_positive(memory_mb: float) -> None:
 def test_grids_of_different_kinds_do_not_merge(voxel_mm: float, full: bool) -> None:
     with pytest.raises(SettingsError, match="merged"):
         VoxelGrid(1.0).merge(VoxelGrid(voxel_mm, full=full))
+
+
+@pytest.mark.parametrize("memory_mb", [700.0, 0.2])
+def test_the_cloud_of_a_box_is_the_part_of_the_whole_cloud_that_touches_it(memory_mb: float, tmp_path: Path) -> None:
+    points = np.random.default_rng(4).uniform(-40, 40, (20_000, 3))
+    grid = VoxelGrid(2.0, memory_mb=memory_mb, spill_folder=tmp_path)
+    for part in np.array_split(points, 4):
+        grid.add(part)
+    box = np.array([[-13.0, -40.0, 1.5], [9.9, 4.0, 100.0]])
+    whole, part_of_it = grid.fused(min_count=2), grid.fused(min_count=2, box_mm=box)
+    voxels = np.floor(whole.points_mm / 2.0)
+    inside = ((voxels >= np.floor(box[0] / 2.0)) & (voxels <= np.floor(box[1] / 2.0))).all(axis=1)
+    assert 0 < inside.sum() < len(inside)
+    np.testing.assert_array_equal(part_of_it.points_mm, whole.points_mm[inside])
+    np.testing.assert_array_equal(part_of_it.count, whole.count[inside])
+    assert len(grid.fused(box_mm=box + 1000).count) == 0

@@ -14,13 +14,15 @@ from calibrate.result import Calibration
 from drivers.errors import DataError
 from drivers.files.ply import PointCloud
 from drivers.files.session import Session, read_scan, read_session
+from drivers.kinematics import se3
 from measure.cli import app
 from measure.cli_run import run_app
 from measure.console import json_text
 from measure.history.store import History
 from measure.inspecting.nominal import load_nominal
+from measure.inspecting.region import region_of
 from measure.inspecting.result import Inspection
-from measure.inspecting.spec import load_spec
+from measure.inspecting.spec import Alignment, InspectionSpec, load_spec
 from measure.part import CLOUD_FILE, Drawing, PartInProgress, measure_part
 from measure.stitch import StitchSettings, scans_once
 from tests.support.jobs import Parts, draw_ball, make_parts, read_lines, write_lines
@@ -92,8 +94,8 @@ def test_scans_that_come_one_by_one_in_any_order_make_the_same_part(calibration:
     for shot in reversed(scans_once(session)):
         growing.add(session, shot, read_scan(session, shot))
     came = growing.judged(session, drawing, Path("out"), began=0.0)
-    np.testing.assert_array_equal(came.fused.points_mm, once.fused.points_mm)
-    np.testing.assert_array_equal(came.fused.uncertainty_mm, once.fused.uncertainty_mm)
+    np.testing.assert_array_equal(came.grid.fused().points_mm, once.grid.fused().points_mm)
+    np.testing.assert_array_equal(came.grid.fused().uncertainty_mm, once.grid.fused().uncertainty_mm)
     assert told(came.inspection) == told(once.inspection)
     assert came.stitched.counts == once.stitched.counts
 
@@ -106,8 +108,27 @@ def test_a_picture_that_was_taken_again_leaves_nothing_of_the_first(calibration:
     wrong = PointCloud(read_scan(session, first).xyz_mm + np.float32(3.0))
     growing.add(session, replace(first, index=77), wrong)
     came = growing.judged(session, drawing, Path("out"), began=0.0)
-    np.testing.assert_array_equal(came.fused.points_mm, once.fused.points_mm)
+    np.testing.assert_array_equal(came.grid.fused().points_mm, once.grid.fused().points_mm)
     assert told(came.inspection) == told(once.inspection)
+
+
+def test_a_region_holds_what_datums_move_a_little_and_says_so_where_they_move_more(drawing: Drawing) -> None:
+    plane = {"kind": "plane", "size_mm": [40, 30]}
+    features = {
+        "top": {**plane, "centre_mm": [0, 0, 40], "normal": [0, 0, 1]},
+        "side": {**plane, "centre_mm": [60, 0, 20], "normal": [1, 0, 0]},
+        "front": {**plane, "centre_mm": [0, -40, 20], "normal": [0, -1, 0]},
+    }
+    place = se3.from_rotation_translation(se3.exp_so3([0.1, -0.2, 0.7]), [900.0, 100.0, 200.0])
+    alignment = {"method": "datums", "primary": "top", "secondary": "side", "tertiary": "front", "base_from_part": place.tolist()}
+    spec = InspectionSpec.model_validate({"format": "spherecal-inspection/1", "features": features, "alignment": alignment})
+    region = region_of(spec, drawing.nominal)
+    assert region is not None
+    # by as much as the first search finds, and a turn that moves the ends as far
+    near, far = (se3.inverse(place @ se3.exp([k * 4.0, k * -4.0, k * 4.0, 0, 0, k * 0.05])) for k in (1.0, 8.0))
+    assert region.holds(near)
+    assert not region.holds(far)
+    assert region_of(spec.model_copy(update={"alignment": Alignment(method="best_fit")}), drawing.nominal) is None
 
 
 def test_a_session_without_a_good_scan_is_refused(parts: Parts, calibration: Calibration, drawing: Drawing, tmp_path: Path) -> None:
