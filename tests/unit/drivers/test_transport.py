@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -20,9 +21,9 @@ NAME = "robot.cell.example"
 
 def known_as(monkeypatch: pytest.MonkeyPatch, *addresses: str, after_s: float = 0.0) -> None:
     """Let the name have these addresses."""
-    real: Callable[..., list[tuple[object, ...]]] = socket.getaddrinfo
+    real: Callable[..., list[Any]] = socket.getaddrinfo
 
-    def look_up(host: str, *rest: object, **options: object) -> list[tuple[object, ...]]:
+    def look_up(host: str, *rest: object, **options: object) -> list[Any]:
         if host != NAME:
             return real(host, *rest, **options)
         time.sleep(after_s)

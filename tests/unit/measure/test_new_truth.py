@@ -22,7 +22,7 @@ LENGTHS = (("A", "B", 300.012), ("B", "C", 240.5), ("C", "A", 245.0))
 U_MM = 0.004
 
 
-def cell_file(folder: Path, model: str | None = "ur5e", **changes: object) -> Path:
+def cell_file(folder: Path, **changes: object) -> Path:
     """Three spheres, a length for every pair, a table."""
     spheres: dict[str, dict[str, object]] = {
         name: {"diameter_mm": 38.1, "expanded_uncertainty_mm": 0.002, "centre_in_base_mm": list(place)}
@@ -31,7 +31,7 @@ def cell_file(folder: Path, model: str | None = "ur5e", **changes: object) -> Pa
     data: dict[str, Any] = {
         "format": "spherecal-cell/1",
         "name": "drawn",
-        "robot": {"driver": "simulated", "model": model, "truth": "truth.yaml"},
+        "robot": {"driver": "simulated", "model": "ur5e", "truth": "truth.yaml"},
         "camera": {"driver": "simulated"},
         "flange_from_camera": None,
         "spheres": spheres,

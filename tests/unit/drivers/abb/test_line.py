@@ -13,13 +13,14 @@ from drivers.abb.adapter import AbbRobot
 from drivers.abb.line import LineClient, Refusal
 from drivers.abb.protocol import Code, Fault, Verb, encode
 from drivers.abb.settings import AbbSettings
+from drivers.contract.checks import ContractBroken
+from drivers.contract.wire import Recorder, Transcript, played
 from drivers.errors import LinkLost, MotionRefused, RobotError, RobotTimeout, WrongController
 from drivers.kinematics.se3 import FloatArray
 from drivers.protocols import MAX_AGE_S, RobotState
 from tests.support.abb import TARGETS_DEG, abb_model, controller, robot_over_tcp
 from tests.support.abb_virtual import VirtualCell, VirtualTime, virtual_cell
 from tests.support.source import ROOT
-from tests.support.wire import Recorder, Transcript, played
 
 SESSION = ROOT / "fixtures" / "wire" / "abb_session.txt"
 
@@ -97,7 +98,7 @@ def test_a_transcript_is_strict(change: str) -> None:
     client.open(1.0)
     if change == "more":
         client.ask(Verb.HELLO, timeout_s=1.0)
-    with pytest.raises(AssertionError):
+    with pytest.raises(ContractBroken):
         client.ask(Verb.HELLO, timeout_s=1.0)
 
 

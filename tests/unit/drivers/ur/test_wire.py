@@ -14,7 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.contract.checks import in_time
+from drivers.contract.checks import ContractBroken, in_time
+from drivers.contract.wire import serving
 from drivers.errors import RobotError, RobotNotReached, RobotTimeout, WrongController
 from drivers.kinematics import mdh
 from drivers.models import load_robot_model
@@ -29,8 +30,10 @@ from drivers.ur.arm import arm_of, read_arm
 from drivers.ur.net import DASHBOARD_PORT, PRIMARY_PORT, Deadline, address_of
 from drivers.ur.preflight import Version, preflight
 from tests.support.fake_ur import own_address
+from tests.support.source import ROOT
 
 HOST = "127.0.0.1"
+WIRE = ROOT / "fixtures" / "wire"
 N_PACKAGES = 2000
 GOOD_REPLIES = wire.package(wire.REQUEST_PROTOCOL_VERSION, b"\x01") + wire.package(wire.GET_URCONTROL_VERSION, struct.pack(">4I", 5, 11, 1, 7))
 
@@ -76,6 +79,22 @@ def talker() -> Iterator[Talker]:
 def test_a_controller_that_answers(talker: Talker) -> None:
     talker.says = wire.package(wire.TEXT_MESSAGE, b"\x05hello") + GOOD_REPLIES
     assert preflight(HOST, Deadline.after(1), port=talker.port) == Version(5, 11, 1, 7)
+
+
+def test_preflight_and_dashboard_say_exactly_what_was_recorded() -> None:
+    with serving(WIRE / "ur_preflight.txt") as (host, port):
+        assert str(preflight(host, Deadline.after(2), port=port)) == "5.11.1"
+    with serving(WIRE / "ur_dashboard.txt", own_address(6), DASHBOARD_PORT) as (host, _):
+        who = dashboard.identity(host, Deadline.after(2))
+    assert (who.model, who.serial, who.remote, who.program) == ("UR5", "20235500123", False, "production.urp")
+    for questions in (("PolyscopeVersion",), ("robotmode",)):  # one step too few, and another one than was recorded
+        with pytest.raises(ContractBroken, match="where '> "), serving(WIRE / "ur_dashboard.txt", own_address(6), DASHBOARD_PORT) as (host, _):
+            ask_and_leave(host, *questions)
+
+
+def ask_and_leave(host: str, *questions: str) -> None:
+    with contextlib.suppress(RobotError):
+        dashboard.ask(host, *questions, deadline=Deadline.after(2))
 
 
 def outcome(port: int) -> str:
