@@ -77,6 +77,17 @@ class PolynomialError:
         return result
 
     @property
+    def turns(self) -> FloatArray:
+        """(k, g) coefficients in mm by which the field turns every point about the box's centre, as the hand-eye transform can."""
+        place = {(axis, degrees): column for column, (axis, degrees) in enumerate(self.terms)}
+        pairs = [(a, b) for a, b in ((0, 1), (1, 2), (0, 2)) if (a, _first_degree(b)) in place and (b, _first_degree(a)) in place]
+        result = np.zeros((len(place), len(pairs)))
+        for column, (a, b) in enumerate(pairs):
+            result[place[a, _first_degree(b)], column] = self.half_size_mm[b]
+            result[place[b, _first_degree(a)], column] = -self.half_size_mm[a]
+        return result
+
+    @property
     def polynomials(self) -> Polynomials:
         """One product a term."""
         return legendre([(axis, [(1.0, degrees)]) for axis, degrees in self.terms], self.centre_mm, self.half_size_mm)
@@ -137,6 +148,10 @@ def _degrees(highest: int) -> list[tuple[int, int, int]]:
     """Degrees in x, y, z of all terms of total degree 1 to `highest`, lowest first."""
     each = range(highest + 1)
     return sorted(((i, j, k) for i, j, k in product(each, each, each) if 0 < i + j + k <= highest), key=lambda t: (sum(t), t))
+
+
+def _first_degree(axis: int) -> tuple[int, int, int]:
+    return (int(axis == 0), int(axis == 1), int(axis == 2))
 
 
 def _legendre_tame(x: FloatArray, degree: int) -> list[FloatArray]:

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.camera_error import CameraError, PolynomialError
 from calibrate.problem import Geometry, Problem, State
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 _HELD_RAD = 1e-12
 _HELD_UP = 1e-12
+_GAUGE_HELD = 1e3
 PATCHES = 12
 """Independent patches that a shot's form error is counted as."""
 
@@ -109,17 +111,17 @@ def linearise(problem: Problem, state: State, geometry: Geometry, moments: Float
     noise_gradient = _sum_by_scan((noise_t @ edge[:, :3, None])[..., 0], problem.scan, n_scans)
     cross = _sum_by_scan(noise_t @ weighted[:, :3], problem.scan, n_scans)
     length_hessian, length_gradient, length_cost = _lengths(problem, state)
-    prior_precision, prior_value = _priors(problem, state)
+    prior_hessian, prior_value = _priors(problem, state)
     data_hessian = data_hessian + length_hessian
     return Linearised(
-        hessian=data_hessian + np.diag(prior_precision),
-        gradient=gradient + length_gradient + prior_precision * prior_value,
+        hessian=data_hessian + prior_hessian,
+        gradient=gradient + length_gradient + prior_hessian @ prior_value,
         data_hessian=data_hessian,
         noise_hessian=noise_hessian,
         noise_gradient=noise_gradient,
         cross=cross,
         pose_noise=state.pose_noise,
-        cost=float(scaled[:, -1, -1].sum() + length_cost + (prior_precision * prior_value**2).sum()),
+        cost=float(scaled[:, -1, -1].sum() + length_cost + prior_value @ prior_hessian @ prior_value),
     )
 
 
@@ -131,9 +133,9 @@ def held_poses(problem: Problem, state: State, jacobian: FloatArray, miss_mm: Fl
     root = np.sqrt(weight)
     rows = (jacobian * root[:, None, None]).reshape(-1, jacobian.shape[-1])
     length_hessian, length_gradient, _ = _lengths(problem, state)
-    prior_precision, prior_value = _priors(problem, state)
-    hessian = rows.T @ rows + length_hessian + np.diag(prior_precision)
-    gradient = rows.T @ (miss_mm * root[:, None]).reshape(-1) + length_gradient + prior_precision * prior_value
+    prior_hessian, prior_value = _priors(problem, state)
+    hessian = rows.T @ rows + length_hessian + prior_hessian
+    gradient = rows.T @ (miss_mm * root[:, None]).reshape(-1) + length_gradient + prior_hessian @ prior_value
     return hessian, gradient
 
 
@@ -260,8 +262,22 @@ def physical_precision(problem: Problem) -> FloatArray:
     return precision
 
 
+def _gauge_precision(model: CameraError) -> FloatArray:
+    """(k, k) inverse variances that hold what a camera field turns every point by: the hand-eye transform turns them as well.
+
+    The priors alone choose among the fields that differ by a turn, N, and they choose the one with N' P c = 0. They are so
+    weak there that what the linearisation leaves of the data outweighed them: a solve of good data then drifted along the
+    turn for ever. Holding N' P c at zero a thousand times as hard changes no minimum, and the drift has no room.
+    """
+    precision = np.asarray(model.prior_sigma_mm, dtype=np.float64) ** -2.0
+    if not isinstance(model, PolynomialError):
+        return np.zeros((len(precision), len(precision)))
+    weighted = precision[:, None] * model.turns
+    return np.asarray(_GAUGE_HELD * weighted @ np.linalg.inv(model.turns.T @ weighted) @ weighted.T)
+
+
 def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """Inverse variances (P,) and current values (P,) of the unknowns that have a prior."""
+    """Inverse covariance (P, P) and current values (P,) of the unknowns that have a prior."""
     layout, precision = problem.layout, physical_precision(problem)
     value = np.zeros(layout.size)
     precision[layout.centres.start :] = 0.0
@@ -276,4 +292,6 @@ def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     value[layout.terms] = state.terms_rad
     value[layout.radius_offset] = state.radius_offset_mm
     value[layout.sphere_radius] = state.sphere_radius_deviation_mm
-    return precision, value
+    hessian = np.diag(precision)
+    hessian[layout.camera, layout.camera] += _gauge_precision(problem.camera_error)
+    return hessian, value

@@ -26,6 +26,7 @@ from calibrate.camera_error_field import field_variants, lateral_variants, riche
 from calibrate.camera_error_stack import StackedModels
 from calibrate.polynomials import Polynomials
 from drivers.errors import FileError, SettingsError
+from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 
 CENTRE, HALF = (10.0, -5.0, 320.0), (120.0, 80.0, 90.0)
@@ -94,6 +95,19 @@ def test_points_that_are_not_there_stay_so_and_spoil_no_other(model: CameraError
     np.testing.assert_array_equal(moved[1::3], whole[1::3])
     if len(model.axis):
         assert np.isnan(moved[::3, 2]).all()
+
+
+@pytest.mark.parametrize(("degree", "lateral", "n_turns"), [(1, 1, 3), (3, 2, 3), (4, 0, 0)])
+def test_turns_of_a_field_are_those_of_a_rigid_body_about_the_box_s_centre(degree: int, lateral: int, n_turns: int) -> None:
+    field = PolynomialError(CENTRE, HALF, degree, lateral)
+    assert field.turns.shape == (len(field.axis), n_turns)
+    p, arms = points(13), points(13) - CENTRE
+    for turn in field.turns.T:
+        moved = correction_in_camera_mm(field, turn, p)
+        # a unit vector w with moved = w x arm: from any three arms, then tried on all
+        about = np.linalg.lstsq(np.concatenate([-se3.hat(arm) for arm in arms]), moved.ravel(), rcond=None)[0]
+        np.testing.assert_allclose(moved, np.cross(about, arms), atol=1e-9)
+        assert np.linalg.norm(about) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("sight_crossing_mm", [(60.0, 0.0, 500.0), (-35.0, 12.0, 700.0)])

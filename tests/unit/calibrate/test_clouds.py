@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calibrate.camera_error import NoCameraError, PillowError
+from calibrate.camera_error_field import box_of_points, default_field
 from calibrate.clouds import solve_clouds
 from calibrate.normal import NoiseModel
 from calibrate.validation import cross_validate, folds_of, predict
@@ -52,6 +53,29 @@ def test_the_end_does_not_depend_on_the_start() -> None:
     for end in ends[1:]:
         # the base is free: places against each other are not
         np.testing.assert_allclose(se3.apply(se3.fit_rigid(end, ends[0]), end), ends[0], atol=1e-6)
+
+
+def test_a_turn_that_camera_field_and_hand_eye_may_share_is_shared_in_one_way_from_every_start() -> None:
+    """The data say nothing of it; a solve once drifted along it for ever and ended as a failure of good shots."""
+    cell, rng = paper_cell(True), np.random.default_rng(12)
+    shots = draw_shots(cell, rng, 50, n_points=200)
+    box = box_of_points(np.concatenate([shot.points_in_camera_mm for shot in shots]))
+    field = default_field(box)
+    problem = problem_of(cell, shots, field)
+    start = start_of(problem, cell)
+    turn_rad = np.array([3e-3, -2e-3, 4e-3])
+    # each turn of the field is about one axis of the camera; the hand-eye transform turns back
+    centre = se3.apply(start.flange_from_camera, field.centre_mm)
+    about = se3.from_rotation_translation(np.eye(3), centre)
+    back = about @ se3.exp(np.concatenate([np.zeros(3), start.flange_from_camera[:3, :3] @ turn_rad])) @ se3.inverse(about)
+    turned = replace(start, flange_from_camera=back @ start.flange_from_camera, camera_mm=field.turns @ turn_rad[[2, 0, 1]])
+    plain, other = (solve_clouds(problem, s, FIRST_NOISE) for s in (start, turned))
+    assert max(plain.passes, other.passes) < 15
+    assert not any(solution.held for solution in (plain, other))
+    np.testing.assert_allclose(other.state.camera_mm, plain.state.camera_mm, atol=1e-5)
+    prior = field.prior_sigma_mm**-2.0
+    share = np.abs(field.turns.T @ (prior * plain.state.camera_mm)) / np.sqrt((field.turns**2 * prior[:, None]).sum(axis=0))
+    assert share.max() < 0.01
 
 
 def test_many_equal_spheres_in_one_shot_order_or_another_give_one_state() -> None:
