@@ -61,7 +61,7 @@ def sphere_candidates(
     Args:
         model: the nominal robot.
         flange_from_camera: (4, 4) first guess.
-        centre_in_base_mm: (3,) the sphere's centre, also a guess.
+        centre_in_base_mm: (3,) the sphere's centre, also a guess; or (n, 3), one place a view.
         radius_mm: of the sphere.
         view: what the camera sees.
         n: views to draw; how many are feasible depends on the cell.
@@ -80,7 +80,7 @@ def sphere_candidates(
     visible = sees_sphere(view, in_camera, radius_mm)
     for other, other_radius in other_spheres:
         visible &= ~_hides(base_from_camera[:, :3, 3], centre, radius_mm, np.asarray(other, dtype=np.float64), other_radius)
-    floor_mm = min(0.0, centre[2] - radius_mm) if law.floor_mm is None else law.floor_mm
+    floor_mm = min(0.0, centre[..., 2].min() - radius_mm) if law.floor_mm is None else law.floor_mm
     return feasible(model, flange_from_camera, base_from_camera, in_camera, visible, law.limit_margin_rad, floor_mm, blocked)
 
 

@@ -223,7 +223,7 @@ def views_at(
     wanted = places_in_base_mm[place]
     if calibration.model is None:
         return _pose_only_views(calibration, place, wanted, seen)
-    poses = calibration.datum.reference_joints_rad if joints_rad is None else joints_rad
+    poses = calibration.datum.references.joints_rad if joints_rad is None else joints_rad
     reference = poses[rng.integers(len(poses), size=len(place))]
     flange_from_camera = calibration.flange_from_camera
     rotation = (calibration.base_from_flange(reference) @ flange_from_camera)[:, :3, :3]

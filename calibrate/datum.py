@@ -1,15 +1,14 @@
 """The base frame of a calibration: a free solve moves it by tenths of a mm, so it must be said (DESIGN.md 3, *Datum*).
 
-The base is the rigid motion that brings the calibrated robot nearest to the nominal one over the work volume, or over the
-poses that were used where the cell states none (see `datum_poses`):
-four points fixed to the flange (its origin and three at the distance of the work) at every reference pose. A constant
+The base is the rigid motion that brings the calibrated robot nearest to the nominal one over the work volume (see
+`datum_poses`): points fixed to the flange where the camera looks, at every reference pose. A constant
 shift of the flange is left free in that fit: link n and the hand-eye transform are one displacement that no data can
 divide between them (METHOD.md 3), and without that freedom their priors would move the base by millimetres.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,10 +18,21 @@ from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray
 
 ARM_MM = 400.0
-"""Distance from the flange at which work is measured: how much orientation counts against position."""
+"""Distance from the flange at which work is measured, where no camera tells: how much orientation counts against position."""
 MAX_REFERENCES = 150
-_CORNERS_MM = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
+CORNERS_MM = np.concatenate([np.zeros((1, 3)), ARM_MM * np.eye(3)])
+"""(4, 3) the flange's origin and three points at arm's length: what is compared where no camera tells where it looks."""
 _ROUNDS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class References:
+    """Where two robots are compared."""
+
+    joints_rad: FloatArray
+    """(k, n) in any order; evenly thinned beyond `MAX_REFERENCES`."""
+    points_in_flange_mm: FloatArray = field(default_factory=lambda: CORNERS_MM)
+    """(p, 3) carried by the flange."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,30 +43,30 @@ class Datum:
     """`nominal_robot`: best fit to it; `controller`: the robot is taken as it reports."""
     base_from_solver: FloatArray
     """(4, 4) from the solver's own base to the stated one."""
-    reference_joints_rad: FloatArray
-    """(k, n) poses over which the fit was made; (0, 0) for `controller`."""
+    references: References
+    """Where the fit was made; no poses for `controller`."""
 
 
 def nominal_robot_datum(
-    model: RobotModel, link_twists: FloatArray, joints_rad: FloatArray, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
+    model: RobotModel, link_twists: FloatArray, over: References, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
 ) -> Datum:
-    """Best fit of the calibrated robot, deflected by its terms, to the nominal one over poses (m, n) in any order."""
-    ordered = joints_rad[np.lexsort(joints_rad.T)]
-    references = ordered[np.unique(np.linspace(0, len(ordered) - 1, min(MAX_REFERENCES, len(ordered))).round().astype(int))]
-    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, references)
-    nominal, solved = mdh.base_from_flange(model, references), mdh.base_from_flange(model, references, link_twists, deflection)
+    """Best fit of the calibrated robot, deflected by its terms, to the nominal one."""
+    ordered, points = over.joints_rad[np.lexsort(over.joints_rad.T)], over.points_in_flange_mm
+    joints = ordered[np.unique(np.linspace(0, len(ordered) - 1, min(MAX_REFERENCES, len(ordered))).round().astype(int))]
+    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, joints)
+    nominal, solved = mdh.base_from_flange(model, joints), mdh.base_from_flange(model, joints, link_twists, deflection)
     base_from_solver, flange_offset = np.eye(4), np.eye(4)
     for _ in range(_ROUNDS):
         moved = base_from_solver @ solved @ flange_offset
-        step = _fit_step(moved, (_points(nominal) - _points(moved)).reshape(-1, 1))[:, 0]
+        step = _fit_step(moved, points, (_carried(nominal, points) - _carried(moved, points)).reshape(-1, 1))[:, 0]
         base_from_solver = se3.exp(step[:6]) @ base_from_solver
         flange_offset = flange_offset @ se3.exp(step[6:])
-    return Datum("nominal_robot", base_from_solver, references)
+    return Datum("nominal_robot", base_from_solver, References(joints, points))
 
 
 def controller_datum() -> Datum:
     """The base that the controller reports its poses in."""
-    return Datum("controller", np.eye(4), np.zeros((0, 0)))
+    return Datum("controller", np.eye(4), References(np.zeros((0, 0))))
 
 
 def datum_jacobian(
@@ -67,24 +77,24 @@ def datum_jacobian(
     Terms that are only considered count too: the arm that the base is fitted by yields as much as the arm that measures.
     """
     size = link_twists.size + len(terms)
-    if model is None or not len(datum.reference_joints_rad):
+    if model is None or not len(datum.references.joints_rad):
         return np.zeros((6, size))
-    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, datum.reference_joints_rad)
-    frames = mdh.chain(model, datum.reference_joints_rad, link_twists, deflection)
-    load = load_basis(terms, model, datum.reference_joints_rad)
-    points = _points(frames[:, -1]).reshape(len(frames), 4, 3)
-    corners = np.moveaxis(points, 1, 0)
+    deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, datum.references.joints_rad)
+    frames = mdh.chain(model, datum.references.joints_rad, link_twists, deflection)
+    load = load_basis(terms, model, datum.references.joints_rad)
+    points = datum.references.points_in_flange_mm
+    corners = np.moveaxis(_carried(frames[:, -1], points), 1, 0)
     by_links = np.stack([link_columns(link_twists, frames, corner) for corner in corners], axis=1)
     by_terms = np.stack([term_columns(link_twists, frames, load, corner) for corner in corners], axis=1)
-    return -_fit_step(frames[:, -1], np.concatenate([by_links, by_terms], axis=-1).reshape(-1, size))[:6]
+    return -_fit_step(frames[:, -1], points, np.concatenate([by_links, by_terms], axis=-1).reshape(-1, size))[:6]
 
 
-def _fit_step(base_from_flange: FloatArray, wanted_motion: FloatArray) -> FloatArray:
-    """(12, k): left twist of the base, then right twist of the flange, that best cause motions (12 m, k) of `_points`."""
-    points = _points(base_from_flange).reshape(len(base_from_flange), 4, 3)
+def _fit_step(base_from_flange: FloatArray, points_in_flange_mm: FloatArray, wanted_motion: FloatArray) -> FloatArray:
+    """(12, k): left twist of the base, then right twist of the flange, that best cause motions (3 p m, k) of carried points."""
+    points = _carried(base_from_flange, points_in_flange_mm)
     rotation = base_from_flange[:, None, :3, :3]
     of_base = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape, 3)), -se3.hat(points)], axis=-1)
-    of_flange = np.concatenate([np.broadcast_to(rotation, (*points.shape, 3)), -rotation @ se3.hat(_CORNERS_MM)], axis=-1)
+    of_flange = np.concatenate([np.broadcast_to(rotation, (*points.shape, 3)), -rotation @ se3.hat(points_in_flange_mm)], axis=-1)
     design = np.concatenate([of_base, of_flange], axis=-1).reshape(-1, 12)
     scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3] * 2)
     # poses of one orientation cannot tell a shift of the flange from one of the base: the shorter motion is taken
@@ -124,5 +134,6 @@ def twist_columns(base_from_frame: FloatArray, point_in_base_mm: FloatArray) -> 
     return np.concatenate([rotation, -rotation @ se3.hat(point_in_frame)], axis=-1)
 
 
-def _points(base_from_flange: FloatArray) -> FloatArray:
-    return se3.apply(base_from_flange[:, None], _CORNERS_MM).reshape(-1, 3)
+def _carried(base_from_flange: FloatArray, points_in_flange_mm: FloatArray) -> FloatArray:
+    """(m, p, 3) of points fixed to the flange."""
+    return se3.apply(base_from_flange[:, None], points_in_flange_mm)

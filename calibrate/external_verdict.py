@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from acquire.cell import Cell, Limits
-from calibrate.datum import nominal_robot_datum
+from calibrate.datum import References, nominal_robot_datum
 from calibrate.datum_poses import datum_joints
 from calibrate.external_points import ExternalPoints
 from calibrate.external_result import external_names, external_result
@@ -76,14 +76,14 @@ def robot_alone_result(
 ) -> Calibration:
     """The calibration of a solve on external points alone, with everything that a file must hold.
 
-    The base is stated as for spheres: best fit to the nominal robot over the poses used. Hand-eye transform and camera
+    The base is stated as for spheres: best fit to the nominal robot. Hand-eye transform and camera
     are handed on as the cell file has them, and `hand_eye` says so; in the covariance they are as good as unknown.
     """
     problem, state = solved.solution.problem, solved.solution.state
     points, model = problem.external, problem.model
     if points is None or model is None:
         raise DataError("there are no external points", remedy="Give shots with reference, target and point_in_reference_mm.")
-    over = datum_joints(model, cell.work_volume_box_mm, points.joints_rad)
+    over = References(datum_joints(model, cell.work_volume_box_mm, points.joints_rad))
     datum = nominal_robot_datum(model, state.link_twists, over, problem.terms, state.terms_rad)
     held_out, predicted = rms_mm(solved.held_out_mm), predicted_rms_mm(solved.solution)
     scale = max(1.0, (held_out / predicted) ** 2) if np.isfinite(held_out) else 1.0

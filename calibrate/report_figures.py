@@ -18,7 +18,7 @@ from calibrate.budget import ErrorBudget, error_budget
 from calibrate.camera_field import seen_cells
 from calibrate.clouds import Solution
 from calibrate.datum import controller_datum, nominal_robot_datum
-from calibrate.datum_poses import datum_joints
+from calibrate.datum_poses import datum_joints, datum_references
 from calibrate.design_cell import work_box_mm
 from calibrate.design_shots import Expectation
 from calibrate.external_result import external_names, external_result
@@ -64,7 +64,7 @@ def make_result(
     datum = controller_datum()
     joints, used = _all_joints(problem), problem.n_shots + (0 if problem.external is None else problem.external.n_shots)
     if problem.model is not None and joints is not None:
-        over = datum_joints(problem.model, cell.work_volume_box_mm, joints)
+        over = datum_references(cell, problem.model, state.flange_from_camera, state.centres_in_base_mm, joints)
         datum = nominal_robot_datum(problem.model, state.link_twists, over, problem.terms, state.terms_rad)
     trained = predict(problem, state)
     line_profile = not problem.along_sight
@@ -219,10 +219,11 @@ def _length_place(assembled: Assembled, cell: Cell, result: Calibration) -> str:
 
 def _length_uncertainty(result: Calibration, cell: Cell, assembled: Assembled, solution: Solution) -> float | None:
     """Expanded uncertainty (k = 2) of the least certain length over the work volume; without one, between sphere places or about the only one."""
-    n_spheres = len(assembled.sphere_names)
-    if result.model is None or not n_spheres or (cell.work_volume_mm is None and n_spheres > 1):
+    n_spheres, used_rad = len(assembled.sphere_names), _all_joints(assembled.problem)
+    if result.model is None or used_rad is None or not n_spheres or (cell.work_volume_mm is None and n_spheres > 1):
         return _longest_length_uncertainty(assembled, solution, result.covariance)
-    return volume_length_uncertainty_mm(result, work_box_mm(cell, solution.state.centres_in_base_mm))
+    joints = datum_joints(result.model, cell.work_volume_box_mm, used_rad)
+    return volume_length_uncertainty_mm(result, work_box_mm(cell, solution.state.centres_in_base_mm), joints)
 
 
 def _longest_length_uncertainty(assembled: Assembled, solution: Solution, covariance: FloatArray) -> float | None:

@@ -17,7 +17,7 @@ from acquire.plan import PlannedPose
 from calibrate.budget import ErrorBudget
 from calibrate.camera_error import camera_error_from_settings
 from calibrate.camera_field import seen_cells_data, seen_cells_from_data
-from calibrate.datum import Datum
+from calibrate.datum import CORNERS_MM, Datum, References
 from calibrate.external_result import external_data, external_from_data
 from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
@@ -72,7 +72,7 @@ def calibration_data(c: Calibration) -> dict[str, object]:
             name: {"centre_in_base_mm": centre, "radius_offset_mm": c.sphere_radius_offsets_mm[name]}
             for name, centre in c.sphere_centres_in_base_mm.items()
         },
-        "datum": {"kind": c.datum.kind, "base_from_solver": c.datum.base_from_solver, "reference_joints_rad": _rows(c.datum.reference_joints_rad)},
+        "datum": _datum_data(c.datum),
         "seen_axis_ranges_rad": c.seen_joints_rad,
         "temperatures_c": dict(c.temperatures_c),
         "noise": asdict(c.noise),
@@ -151,7 +151,7 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         radius_offset_mm=float(_array(data["radius_offset_mm"])),
         sphere_centres_in_base_mm={name: _array(sphere["centre_in_base_mm"]) for name, sphere in spheres.items()},
         sphere_radius_offsets_mm={name: float(_array(sphere["radius_offset_mm"])) for name, sphere in spheres.items()},
-        datum=Datum(str(datum["kind"]), _rigid(datum["base_from_solver"], file, "datum.base_from_solver"), _from_rows(datum["reference_joints_rad"])),
+        datum=_datum(datum, file),
         seen_joints_rad=None if data["seen_axis_ranges_rad"] is None else _array(data["seen_axis_ranges_rad"]),
         noise=NoiseModel(**{key: float(_array(value)) for key, value in _mapping(data["noise"]).items()}),
         parameter_names=tuple(str(name) for name in _sequence(parameters["names"])),
@@ -176,6 +176,22 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
         seen_cells=seen_cells_from_data(camera["seen_cells"], _array(camera["seen_volume_mm"])) if "seen_cells" in camera else None,
         error_budget=None if data.get("error_budget") is None else ErrorBudget.from_json_dict(_mapping(data["error_budget"])),
     )
+
+
+def _datum_data(datum: Datum) -> dict[str, object]:
+    return {
+        "kind": datum.kind,
+        "base_from_solver": datum.base_from_solver,
+        "reference_joints_rad": _rows(datum.references.joints_rad),
+        "reference_points_in_flange_mm": datum.references.points_in_flange_mm,
+    }
+
+
+def _datum(data: Mapping[str, object], file: str) -> Datum:
+    # older files compared the flange's own corners
+    points = _array(data["reference_points_in_flange_mm"]) if "reference_points_in_flange_mm" in data else CORNERS_MM
+    base_from_solver = _rigid(data["base_from_solver"], file, "datum.base_from_solver")
+    return Datum(str(data["kind"]), base_from_solver, References(_from_rows(data["reference_joints_rad"]), points.reshape(-1, 3)))
 
 
 def _hand_eye(value: object) -> str:

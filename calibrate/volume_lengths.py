@@ -1,7 +1,7 @@
 """What lengths over the work volume are good for: the figure that a verdict on length must rest on.
 
 Spheres stand where they stand; work is measured over the whole volume, and a length between far places of it is the
-least certain one. The poses of the datum point into the volume from all sides (see `datum_poses`), so that they serve
+least certain one. The poses that `datum_poses` finds point into the volume from all sides, so that they serve
 as views: a place is what some neighbouring views see at the middle of the camera's volume, and what they get wrong
 together is the place's error.
 """
@@ -21,15 +21,14 @@ _SHORTEST_SHARE = 0.25
 _ONE_PLACE_MM = 1.0
 
 
-def volume_length_uncertainty_mm(calibration: Calibration, work_volume_mm: FloatArray) -> float | None:
+def volume_length_uncertainty_mm(calibration: Calibration, work_volume_mm: FloatArray, joints_rad: FloatArray) -> float | None:
     """Expanded uncertainty (k = 2) of the least certain length over a work volume (2, 3), noise of the shots averaged out.
 
-    None where the poses of the datum all point to one place: there is no length then.
+    None where the poses (k, n_axes) all point to one place: there is no length then.
     """
-    joints = calibration.datum.reference_joints_rad
-    middle = np.broadcast_to(calibration.camera_seen_volume_mm.mean(axis=0), (len(joints), 3))
-    seen = calibration.points_in_base_mm(middle, joints_rad=joints)
-    jacobian = calibration.point_jacobian(middle, joints_rad=joints)
+    middle = np.broadcast_to(calibration.camera_seen_volume_mm.mean(axis=0), (len(joints_rad), 3))
+    seen = calibration.points_in_base_mm(middle, joints_rad=joints_rad)
+    jacobian = calibration.point_jacobian(middle, joints_rad=joints_rad)
     places = _spread(seen, work_volume_mm)
     moved = [jacobian[np.argsort(np.linalg.norm(seen - seen[place], axis=1), kind="stable")[:_VIEWS]].mean(axis=0) for place in places]
     covariance = calibration.covariance[: jacobian.shape[-1], : jacobian.shape[-1]]

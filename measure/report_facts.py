@@ -13,7 +13,7 @@ from drivers.registry import untried_drivers
 from measure.report_page import CalibrationFacts, ShotResidual
 
 _DATUM_TEXTS = {
-    "nominal_robot": "base = best fit of the calibrated to the nominal robot over the poses used",
+    "nominal_robot": "base = best fit of the calibrated to the nominal robot over the work volume",
     "controller": "base = as the controller reports it",
 }
 

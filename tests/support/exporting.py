@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from calibrate import Calibration
 from calibrate.camera_error import NoCameraError
-from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.datum import References, controller_datum, nominal_robot_datum
 from calibrate.normal import NoiseModel
 from calibrate.result import Statistics
 from drivers.kinematics import mdh, se3
@@ -51,7 +51,7 @@ def calibration_of(
         twists = rng.normal(size=(model.n_joints, 6)) * TWIST_SIGMA
         middle = np.array([0.2, -0.1, 0.3, 0.1, -0.9, 0.5])
         seen = np.stack([middle - SEEN_HALF_RANGE_RAD, middle + SEEN_HALF_RANGE_RAD])
-        datum = nominal_robot_datum(model, twists, rng.uniform(seen[0], seen[1], size=(40, model.n_joints)))
+        datum = nominal_robot_datum(model, twists, References(rng.uniform(seen[0], seen[1], size=(40, model.n_joints))))
     # what else a calibration may hold of a robot is nothing here
     further: dict[str, Any] = {"terms": (), "terms_rad": np.zeros(0)}
     known = {field.name for field in fields(Calibration)}

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from acquire.cell import Cell, Limits, load_cell, robot_model_of
 from acquire.session import SessionWriter
 from calibrate.camera_error import PillowError
-from calibrate.datum import nominal_robot_datum
+from calibrate.datum import References, nominal_robot_datum
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot, gather_observations
 from calibrate.result import Calibration, ShotResult, Statistics
@@ -165,7 +165,7 @@ def nominal_calibration(cell: Cell, sessions: Sequence[Session]) -> Calibration:
         radius_offset_mm=0.01,
         sphere_centres_in_base_mm={name: np.array(place) for name, place in PLACES.items()},
         sphere_radius_offsets_mm=dict.fromkeys(PLACES, 0.01),
-        datum=nominal_robot_datum(model, np.zeros((6, 6)), joints),
+        datum=nominal_robot_datum(model, np.zeros((6, 6)), References(joints)),
         seen_joints_rad=np.array([joints.min(axis=0), joints.max(axis=0)]),
         noise=NoiseModel(point_mm=0.05, pose_mm=0.01, pose_rad=1e-4),
         parameter_names=(),

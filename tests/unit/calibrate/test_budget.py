@@ -37,7 +37,7 @@ def covariance_of(calibration: Calibration, views: Views) -> FloatArray:
 def test_the_total_is_the_trace_of_the_point_s_covariance(calibration: Calibration) -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform([-90, -50, 260], [90, 50, 390], (12, 3))
-    joints = calibration.datum.reference_joints_rad[rng.integers(len(calibration.datum.reference_joints_rad), size=12)]
+    joints = calibration.datum.references.joints_rad[rng.integers(len(calibration.datum.references.joints_rad), size=12)]
     pose, point = calibration.noise_covariances_mm2(points, calibration.base_from_flange(joints))
     views = Views(np.arange(12), points, calibration.point_jacobian(points, joints_rad=joints), pose, point)
     expected = np.trace(calibration.point_covariance_in_base_mm2(points, joints_rad=joints), axis1=1, axis2=2)

@@ -62,7 +62,7 @@ def test_a_robot_is_calibrated_without_camera_or_sphere(robot: TrackedRobot, alo
 def test_the_base_is_the_best_fit_to_the_nominal_robot(robot: TrackedRobot, alone: Calibration) -> None:
     """The datum: no motion of the base brings the calibrated robot nearer to the nominal one, flange shift apart."""
     assert alone.datum.kind == "nominal_robot"
-    joints = alone.datum.reference_joints_rad
+    joints = alone.datum.references.joints_rad
     nominal = mdh.base_from_flange(robot.model, joints)
     moved = pose_errors_mm(alone.base_from_flange(joints), nominal)
     plain = np.linalg.norm(se3.apply(alone.base_from_flange(joints), [0, 0, 150.0]) - se3.apply(nominal, [0, 0, 150.0]), axis=1)

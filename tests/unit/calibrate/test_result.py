@@ -127,7 +127,7 @@ def with_links(c: Calibration, link_twists: FloatArray) -> Calibration:
     """The calibration with other link twists, in the base that the datum then states."""
     if c.model is None:
         raise LookupError("a pose-only calibration has no links")
-    return replace(c, link_twists=link_twists, datum=nominal_robot_datum(c.model, link_twists, c.datum.reference_joints_rad))
+    return replace(c, link_twists=link_twists, datum=nominal_robot_datum(c.model, link_twists, c.datum.references))
 
 
 def moved(c: Calibration, parameter: int, step: float) -> Calibration:
@@ -210,7 +210,7 @@ def test_covariance_of_many_points_is_that_of_each(calibration: Calibration, mon
 
 def test_far_from_what_was_seen_less_is_known(calibration: Calibration) -> None:
     """Of lengths: single points share what is not known of the base itself."""
-    references = calibration.datum.reference_joints_rad
+    references = calibration.datum.references.joints_rad
     moved_away = references + np.array([0.0, 0.5, -0.5, 1.0, 1.0, 1.0])
     near, far = (np.median([_sigma_of_length(calibration, a, b) for a, b in pairwise(poses)]) for poses in (references, moved_away))
     assert far > 1.4 * near
