@@ -53,11 +53,10 @@ def simulate_controller(
 
         def ready(line: str) -> None:
             run.console.note(line)
-            _afterwards(lambda: [BenchClient(host, made.bench_port).ask(f"fault {text}") for text in fault or ()])
             if until_eof:
                 _afterwards(lambda: _quit_at_eof(BenchClient(host, made.bench_port)))
 
-        serve(made, ready)
+        serve(made, ready, fault or ())
         run.finish({"controller": controller, "host": host})
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 
 from drivers.errors import SettingsError
@@ -55,11 +55,11 @@ class UrController:
         """Port of the bench, the real one once the controller serves."""
         return self._bench_port
 
-    async def run(self, tell: Callable[[str], None]) -> None:
-        """Serve; `tell` is given one line when the ports are open.
+    async def run(self, tell: Callable[[str], None], faults: Sequence[str] = ()) -> None:
+        """Serve; `tell` is given one line when the ports are open and the faults in force.
 
         Raises:
-            SettingsError: a port is taken.
+            SettingsError: a port is taken, or there is no such fault.
         """
         self._loop = asyncio.get_running_loop()
         with contextlib.ExitStack() as stack:
@@ -69,8 +69,16 @@ class UrController:
             stack.callback(bench.close)
             cycles = asyncio.create_task(self._cycles())
             stack.callback(cycles.cancel)
+            await self._misbehave(faults)
             tell(f"simulated UR controller at {self.host}, bench at {self.host}:{self._bench_port}")
             await self._quit.wait()
+
+    async def _misbehave(self, faults: Sequence[str]) -> None:
+        try:
+            for name, *numbers in (text.split() for text in faults):
+                await self._fault(name, [float(number) for number in numbers])
+        except ValueError as error:
+            raise SettingsError(str(error), where="--fault", remedy="Name one of them, with its numbers.") from error
 
     def _open_bench(self) -> BenchServer:
         try:
@@ -241,11 +249,11 @@ def _taken(port: int, host: str, error: OSError) -> SettingsError:
     return SettingsError(f"port {port} of {host} cannot be opened ({error.strerror})", where="--host", remedy=remedy)
 
 
-def serve(controller: UrController, tell: Callable[[str], None]) -> None:
-    """Run a controller until it is told to quit, or interrupted.
+def serve(controller: UrController, tell: Callable[[str], None], faults: Sequence[str] = ()) -> None:
+    """Run a controller, misbehaving from the start where faults are named, until it is told to quit, or interrupted.
 
     Raises:
-        SettingsError: a port is taken.
+        SettingsError: a port is taken, or there is no such fault.
     """
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(controller.run(tell))
+        asyncio.run(controller.run(tell, faults))
