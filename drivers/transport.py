@@ -46,7 +46,8 @@ def addresses_of(host: str, timeout_s: float, family: socket.AddressFamily = soc
     except queue.Empty:
         result = OSError("the name server does not answer")
     if isinstance(result, OSError):
-        raise RobotNotReached(f"{host!r} has no address: {result}", where="robot.host", remedy="Write the robot's IP address.") from result
+        what = "IPv4" if family is socket.AF_INET else "IP"
+        raise RobotNotReached(f"{host!r} has no address: {result}", where="robot.host", remedy=f"Write the robot's {what} address.") from result
     return result
 
 
