@@ -8,7 +8,16 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, ConfigDict, Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from acquire.obstacles import Obstacle
 from drivers.errors import FileError
@@ -121,6 +130,13 @@ class Limits(StrictModel):
     length_error_mm: Positive
     diameter_error_mm: Positive
     form_mm: Positive
+    guard: Literal["reference_and_repeat", "reference"] = "reference_and_repeat"
+    """What the guard band of a verification holds: see `measure.decision`."""
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, plain: SerializerFunctionWrapHandler) -> dict[str, object]:
+        """Without a guard that nobody chose: files of older versions, and their digests, stay what they were."""
+        return {key: value for key, value in plain(self).items() if key != "guard" or self.guard != "reference_and_repeat"}
 
 
 class Motion(StrictModel):

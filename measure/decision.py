@@ -1,8 +1,10 @@
 """Conform, reject, or not proven: a figure against its limit when the figure itself is uncertain.
 
 The zones of ISO 14253-1: a value conforms when it keeps the limit by a guard band g, is rejected when it exceeds the
-limit by g, and proves nothing in between; g = 1.65 u (95 %, one-sided). u is the uncertainty *of the test* (artefact,
-repeatability of the figure), not that of the system under test: that one is what is being judged.
+limit by g, and proves nothing in between; g = 1.65 u (95 %, one-sided). u is the uncertainty *of the test*, never what the
+calibration says of itself: that one is what is being judged. The limits of a cell choose between two u
+(docs/decisions/0010-verification-figures.md): reference and repeat, where the limit is one on the *system's* error, which
+few views show only so well; or the reference alone, where the limit is one on the *values of this test*, scatter included.
 """
 
 from __future__ import annotations
@@ -15,10 +17,16 @@ Verdict = Literal["conform", "not_proven", "reject"]
 
 GUARD_FACTOR = 1.65
 
-RULE = (
-    f"conform: |value| <= limit - {GUARD_FACTOR} u; reject: |value| > limit + {GUARD_FACTOR} u; not proven between; "
-    "u: standard uncertainty of the test (artefact and repeatability)"
+_ZONES = (
+    f"conform: |value| <= limit - {GUARD_FACTOR} u; reject: |value| > limit + {GUARD_FACTOR} u; not proven between (zones of ISO 14253-1, 95 %); u: "
 )
+RULE = f"{_ZONES}standard uncertainty of the test (artefact and repeatability)"
+RULE_OF_VALUES = f"{_ZONES}standard uncertainty of the test values (artefact alone: the limits are on what this test shows, scatter included)"
+
+
+def rule_of(guard: str | None) -> str:
+    """The rule in words for what the limits choose as guard; the usual one for None."""
+    return RULE_OF_VALUES if guard == "reference" else RULE
 
 
 @dataclass(frozen=True, slots=True)

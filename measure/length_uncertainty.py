@@ -73,20 +73,34 @@ def end_of(calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots
     return End(centre_in_base_mm, _centre_jacobian(calibration, centre_in_base_mm, shots))
 
 
-def _centre_jacobian(calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots: Sequence[SphereShot]) -> FloatArray:
-    """(3, p + 1) motion of a commonly fitted centre per calibration parameter and radius offset."""
-    normal, rows = np.zeros((3, 3)), None
+def diameter_standard_uncertainty_mm(calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots: Sequence[SphereShot]) -> float:
+    """Standard uncertainty of a sphere's diameter fitted to all views with a free radius, as far as the calibration causes it.
+
+    The radius is a fourth unknown of the fit beside the centre (3,), and its radius offset does not come in.
+    """
+    gradient = 2.0 * _centre_jacobian(calibration, centre_in_base_mm, shots, free=True)[3, :-1]
+    used = calibration.covariance[: len(gradient), : len(gradient)]
+    return float(np.sqrt(max(float(gradient @ used @ gradient), 0.0)))
+
+
+def _centre_jacobian(
+    calibration: KnowsItsCovariance, centre_in_base_mm: FloatArray, shots: Sequence[SphereShot], *, free: bool = False
+) -> FloatArray:
+    """(3, p + 1) motion of a commonly fitted centre per calibration parameter and radius offset; (4, p + 1) with the radius where it is free."""
+    size = 4 if free else 3
+    normal, rows = np.zeros((size, size)), None
     for shot in shots:
         points = shot.points_in_camera_mm[:: max(1, -(-len(shot.points_in_camera_mm) // _POINTS_PER_VIEW))]
         pose = pose_of(calibration.model, shot)
         offset = calibration.points_in_base_mm(points, **pose) - centre_in_base_mm
         unit = offset / np.linalg.norm(offset, axis=1, keepdims=True)
         along = np.einsum("ni,nip->np", unit, calibration.point_jacobian(points, **pose))
-        share = unit.T @ np.column_stack([along, -np.ones(len(unit))])
+        design = np.column_stack([unit, np.ones(len(unit))]) if free else unit
+        share = design.T @ np.column_stack([along, -np.ones(len(unit))])
         # each view counts with all its points, as in the fit
         weight = len(shot.points_in_camera_mm) / len(points)
-        normal += weight * unit.T @ unit
+        normal += weight * design.T @ design
         rows = weight * share if rows is None else rows + weight * share
     if rows is None:
-        return np.zeros((3, len(calibration.covariance)))
+        return np.zeros((size, len(calibration.covariance)))
     return np.asarray(np.linalg.solve(normal, rows))

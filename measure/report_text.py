@@ -8,7 +8,6 @@ import numpy as np
 
 from acquire.cell import Limits
 from drivers.registry import hardware_remark
-from measure.decision import RULE
 from measure.proof.lengths import LengthResult
 from measure.report_page import CalibrationFacts, Row, Table
 from measure.verify_result import SHAPED_ON, TRAINING_REMARK, VerifyResult
@@ -207,7 +206,7 @@ def identity_of(facts: CalibrationFacts, verification: VerifyResult | None) -> t
 
 def decision_text(verification: VerifyResult | None) -> str:
     """The decision rule, where one was used."""
-    return "" if verification is None else f"Decision rule: {RULE}."
+    return "" if verification is None else f"Decision rule: {verification.decision_rule}."
 
 
 def mm(value: float | None, *, signed: bool = False) -> str:
@@ -264,16 +263,22 @@ def _length_table(verification: VerifyResult) -> Table:
 
 
 def _sphere_table(verification: VerifyResult) -> Table:
-    lead = "All shots of a sphere stitched, in mm. The last column is the diameter error that is left when the known radius offset is taken away."
-    heads = ("sphere", "views", "points", "form 95 %", "form all", "diameter error", "less offset")
+    lead = (
+        "All shots of a sphere stitched, in mm. The last column is the diameter error that is left when the known radius offset is taken away. "
+        "U (k = 2) of the diameter holds calibration, scatter and certificate; that of the form (95 %) scatter and the artefact's own form."
+    )
+    heads = ("sphere", "views", "points", "form 95 %", "its U", "form all", "diameter error", "its U", "less offset")
+    known = verification.sphere_uncertainties
     rows = tuple(
         (
             name,
             str(s.n_views),
             str(s.n_points),
             f"{s.form_mm:.3f}",
+            f"{known[name].form_expanded_mm:.3f}" if name in known else NOTHING,
             f"{s.form_all_mm:.3f}",
             _signed(s.diameter_error_mm),
+            f"{known[name].diameter_expanded_mm:.3f}" if name in known else NOTHING,
             _signed(s.diameter_error_less_offset_mm),
         )
         for name, s in verification.figures.spheres.items()

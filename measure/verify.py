@@ -29,10 +29,11 @@ from drivers.files.session import Session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.decision import overall
+from measure.length_uncertainty import diameter_standard_uncertainty_mm
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
 from measure.proof.external import external_figures, judgeable, known_external
 from measure.proof.external_lengths import external_gaps, external_lengths
-from measure.proof.judging import gaps_of, judgements
+from measure.proof.judging import gaps_of, judgements, sphere_uncertainties
 from measure.proof.lengths import length_results
 from measure.proof.poses import repeated_poses, training_shots
 from measure.proof.probing import ProbingResult, probing_of
@@ -126,6 +127,8 @@ def verify_observations(
     )
     volume = volume_figures(lengths, cell.work_volume_box_mm)
     outside = (*shots_outside(calibration, observations.shots), *external_outside(calibration, observations.external))
+    by_sphere = {name: [shot for shot in observations.shots if shot.sphere == name] for name in figures.spheres}
+    of_diameters = {n: diameter_standard_uncertainty_mm(calibration, s.centre_in_base_mm, by_sphere[n]) for n, s in figures.spheres.items()}
     judged = () if limits is None else judgements(limits, figures, lengths, cell.spheres)
     external = external_figures(calibration, observations.external)
     of_points = () if views else external_gaps(calibration, observations.external)
@@ -153,6 +156,7 @@ def verify_observations(
             *(() if external is None else external.warnings()),
         ),
         external=external,
+        sphere_uncertainties=sphere_uncertainties(figures.spheres, cell.spheres, of_diameters),
         maps=residual_maps(observations.shots, views, figures, sizes) if views else None,
     )
 

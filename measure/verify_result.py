@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 
 from acquire.cell import Limits
 from calibrate.observations import Observations, RejectedShot
-from measure.decision import GUARD_FACTOR, RULE, Judgement, Verdict
+from measure.decision import GUARD_FACTOR, Judgement, Verdict, rule_of
 from measure.proof.external import ExternalFigures
+from measure.proof.judging import SphereUncertainty
 from measure.proof.lengths import LengthResult
 from measure.proof.probing import Probing, ProbingResult
 from measure.proof.reach import OutsideShot
 from measure.proof.residual_maps import ResidualMaps
 from measure.proof.volume import VolumeFigures
-from measure.sphere_figures import Figures, SphereFigures
+from measure.sphere_figures import Figures, SphereFigures, ViewFigures
 
 SHAPED_ON = "shaped on VDI/VDE 2634-3 and ISO 10360-13 (probing error, sphere spacing error); no conformity to either is claimed"
 TRAINING_REMARK = "TRAINING DATA USED (--allow-training-data): this proves nothing"
@@ -59,6 +61,8 @@ class VerifyResult:
     """What a reader must know of these figures besides the verdict's reasons."""
     external: ExternalFigures | None = None
     """External reference points, told beside the spheres; judged by the lengths between them where no sphere was seen."""
+    sphere_uncertainties: Mapping[str, SphereUncertainty] = field(default_factory=dict)
+    """Of diameter and form, by the sphere's name; empty where only the views' own figures are wanted."""
     maps: ResidualMaps | None = field(default=None, repr=False)
     """What the report draws of the points."""
 
@@ -87,6 +91,11 @@ class VerifyResult:
         """Shots without a findable sphere."""
         return self.observations.rejected
 
+    @property
+    def decision_rule(self) -> str:
+        """In words."""
+        return rule_of(None if self.limits is None else self.limits.guard)
+
     def session_name(self, digest: str) -> str:
         """Folder name of a session."""
         return next((s.name for s in self.sessions if s.digest == digest), digest[:12])
@@ -101,7 +110,8 @@ class VerifyResult:
             "centre_max_mm": self.figures.centre_max_mm,
             "radial_rms_mm": self.figures.radial_rms_mm,
             "lengths": [length.to_json_dict() for length in self.lengths],
-            "spheres": {name: _sphere_json(sphere, self._probing_of(name)) for name, sphere in self.figures.spheres.items()},
+            "spheres": {name: self._sphere_json(sphere) for name, sphere in self.figures.spheres.items()},
+            "views": [_figures_json(self.session_name(view.session), view) for view in self.figures.views],
             "volume": None if self.volume is None else self.volume.to_json_dict(),
             "probing": [self._view_json(p) for p in self.probing if p.session is not None],
             "external": None if self.external is None else self.external.to_json_dict(self.session_name),
@@ -112,7 +122,7 @@ class VerifyResult:
             "before": None if self.before is None else _before_json(self.before, self.before_length_errors_mm),
             "limits": None if self.limits is None else self.limits.model_dump(mode="json"),
             "judgements": [_judgement_json(j) for j in self.judgements],
-            "decision_rule": RULE,
+            "decision_rule": self.decision_rule,
             "procedure": SHAPED_ON,
             "held_out": self.held_out,
             **({} if self.held_out else {"remark": TRAINING_REMARK}),
@@ -123,6 +133,15 @@ class VerifyResult:
 
     def _probing_of(self, sphere: str) -> Probing | None:
         return next((p.probing for p in self.probing if p.sphere == sphere and p.session is None), None)
+
+    def _sphere_json(self, sphere: SphereFigures) -> dict[str, object]:
+        u = self.sphere_uncertainties.get(sphere.name)
+        return {
+            **_sphere_json(sphere, self._probing_of(sphere.name)),
+            "diameter_expanded_uncertainty_mm": None if u is None else u.diameter_expanded_mm,
+            "form_expanded_uncertainty_mm": None if u is None else u.form_expanded_mm,
+            "uncertainty": None if u is None else asdict(u),
+        }
 
     def _view_json(self, view: ProbingResult) -> dict[str, object]:
         probing = None if view.probing is None else view.probing.to_json_dict()
@@ -141,6 +160,18 @@ def _sphere_json(sphere: SphereFigures, probing: Probing | None) -> dict[str, ob
         "centre_in_base_mm": sphere.centre_in_base_mm.tolist(),
         "n_views": sphere.n_views,
         "n_points": sphere.n_points,
+    }
+
+
+def _figures_json(session: str, view: ViewFigures) -> dict[str, object]:
+    return {
+        "session": session,
+        "index": view.index,
+        "sphere": view.sphere,
+        "n_points": view.n_points,
+        "radial_rms_mm": view.radial_rms_mm,
+        "centre_in_base_mm": None if view.centre_in_base_mm is None else view.centre_in_base_mm.tolist(),
+        "deviation_mm": view.deviation_mm,
     }
 
 

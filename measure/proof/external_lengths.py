@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.external import external_sigma_mm
 from calibrate.external_points import ExternalShot
 from calibrate.external_result import ExternalResult
 from calibrate.result import Calibration
@@ -84,12 +85,14 @@ def _length(
     gradient = direction @ (placed[1].motion - placed[0].motion)
     predicted = float(gradient @ calibration.covariance @ gradient)
     test = sum(float(direction @ noise_mm2(calibration, place.lever_mm) @ direction) for place in placed)
+    reference = 2.0 * external_sigma_mm(calibration.noise) ** 2
     return LengthResult(
         between=names,
         measured_mm=float(np.linalg.norm(way)),
         reference_mm=float(np.linalg.norm(shots[1].point_in_reference_mm - shots[0].point_in_reference_mm)),
-        expanded_uncertainty_mm=2.0 * float(np.sqrt(test + max(predicted, 0.0))),
-        test_standard_uncertainty_mm=float(np.sqrt(test)),
+        reference_standard_uncertainty_mm=float(np.sqrt(reference)),
+        repeat_standard_uncertainty_mm=float(np.sqrt(max(test - reference, 0.0))),
+        calibration_standard_uncertainty_mm=float(np.sqrt(max(predicted, 0.0))),
         unseen_places=all(_is_unseen(known, shot) for shot in shots),
     )
 

@@ -45,16 +45,28 @@ class LengthResult:
     between: tuple[str, str]
     measured_mm: float
     reference_mm: float
-    expanded_uncertainty_mm: float
-    """Of the measured value, k = 2: calibration, scatter between the views, reference."""
-    test_standard_uncertainty_mm: float
-    """Reference and scatter alone: what the decision is charged with."""
+    reference_standard_uncertainty_mm: float
+    """Certificate, at the temperature when seen."""
+    repeat_standard_uncertainty_mm: float
+    """Scatter between the views."""
+    calibration_standard_uncertainty_mm: float
+    """What the calibration leaves open of this length; no decision is charged with it."""
     not_judged: str | None = None
     """Why this length says nothing about the system; None where it does."""
     unseen_places: bool = True
     """Whether no sphere of the calibration stood at either end."""
     pairs: PairFigures | None = None
     """View by view; None where no two views of the ends make a pair, and for line profiles."""
+
+    @property
+    def test_standard_uncertainty_mm(self) -> float:
+        """Reference and repeat: of the test, not of the system."""
+        return float(np.hypot(self.reference_standard_uncertainty_mm, self.repeat_standard_uncertainty_mm))
+
+    @property
+    def expanded_uncertainty_mm(self) -> float:
+        """Of the error, k = 2: reference, repeat and calibration."""
+        return 2.0 * float(np.hypot(self.test_standard_uncertainty_mm, self.calibration_standard_uncertainty_mm))
 
     @property
     def error_mm(self) -> float:
@@ -82,6 +94,9 @@ class LengthResult:
             "reference_mm": self.reference_mm,
             "error_mm": self.error_mm,
             "expanded_uncertainty_mm": self.expanded_uncertainty_mm,
+            "reference_standard_uncertainty_mm": self.reference_standard_uncertainty_mm,
+            "repeat_standard_uncertainty_mm": self.repeat_standard_uncertainty_mm,
+            "calibration_standard_uncertainty_mm": self.calibration_standard_uncertainty_mm,
             "not_judged": self.not_judged,
             "unseen_places": self.unseen_places,
             "slide": self.is_slide,
@@ -112,14 +127,13 @@ def _length(
     ends = [figures.spheres[name] for name in length.between]
     measured, scatter = separation(ends[0], ends[1])
     shots = [by_sphere[name] for name in length.between]
-    test = float(np.hypot(scatter, length.standard_uncertainty_mm))
-    predicted = distance_standard_uncertainty_mm(calibration, *(known[name] for name in length.between))
     return LengthResult(
         between=length.between,
         measured_mm=measured,
         reference_mm=length.length_mm,
-        expanded_uncertainty_mm=2.0 * float(np.hypot(test, predicted)),
-        test_standard_uncertainty_mm=test,
+        reference_standard_uncertainty_mm=length.standard_uncertainty_mm,
+        repeat_standard_uncertainty_mm=scatter,
+        calibration_standard_uncertainty_mm=distance_standard_uncertainty_mm(calibration, *(known[name] for name in length.between)),
         not_judged=_why_not_judged([end.n_views for end in ends], shots),
         unseen_places=all(is_unseen_place(calibration, end.centre_in_base_mm) for end in ends),
         pairs=_pairs(length.length_mm, shots, figures),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from measure.proof.probing import Probing
 from measure.proof.slide import CAUTION, NOTHING, slide_rows
 from measure.report_page import Table
@@ -10,7 +12,8 @@ from measure.verify_result import VerifyResult
 
 def proof_tables(result: VerifyResult) -> tuple[Table, ...]:
     """Those that have anything to say."""
-    return tuple(table for table in (_probing(result), _slides(result), _external(result), _outside(result)) if table.rows)
+    found = (_probing(result), _slides(result), _external(result), _outside(result), _shots(result))
+    return tuple(table for table in found if table.rows)
 
 
 def _probing(result: VerifyResult) -> Table:
@@ -57,6 +60,25 @@ def _external(result: VerifyResult) -> Table:
         "Where the calibrated robot expects a target minus where the reference saw it, in the base, with U (k = 2) of this difference: calibration "
         f"of robot, reference and target, pose noise, noise of the reference. {together}The camera does not come in. {judged} mm.",
         ("point", "reference", "target", "x", "y", "z", "distance"),
+        tuple(rows),
+    )
+
+
+def _shots(result: VerifyResult) -> Table:
+    shots = {(shot.session, shot.index, shot.sphere): shot for shot in result.observations.shots}
+    rows = []
+    for view in result.figures.views:
+        shot = shots[view.session, view.index, view.sphere]
+        centre = NOTHING if shot.centre_in_camera_mm is None else " ".join(f"{x:.1f}" for x in shot.centre_in_camera_mm)
+        off = NOTHING if view.deviation_mm is None else f"{view.deviation_mm:.3f}"
+        axes = NOTHING if shot.joints_rad is None else " ".join(f"{q:.1f}" for q in np.degrees(shot.joints_rad))
+        rows.append(
+            (result.session_name(view.session), str(view.index), view.sphere, str(view.n_points), f"{view.radial_rms_mm:.3f}", off, centre, axes)
+        )
+    return Table(
+        "Every shot of the verification",
+        "Radial rms: about the sphere's common centre. Off: distance of the shot's own centre from the mean of its sphere's. mm; axes in degrees.",
+        ("session", "shot", "sphere", "points", "radial rms", "off", "x, y, z in camera", "axes"),
         tuple(rows),
     )
 

@@ -37,6 +37,15 @@ def test_100_volume_tests_are_honest() -> None:
     # the same figures against limits from far below to far above what the cells can do
     judged = [again for cell in found for again in (cell.judged_against(share * cell.largest_mm) for share in (0.7, 0.85, 0.95, 1.05, 1.5))]
     print(f"conform and wrong: {100 * wrongly_conform(judged):.1f} %")
+    # at half that limit, four standard uncertainties, no guard band on every length can hold repeats; one of the reference alone passes
+    strict = [cell.judged_against(cell.limit_mm / 2, "reference") for cell in found if cell.largest_mm <= cell.limit_mm / 4]
+    n_conform = [cell.result.verdict for cell in strict].count("conform")
+    print(f"{len(strict)} cells twice as good as four standard uncertainties, by the reference alone conform {n_conform}")
+    assert n_conform > 0.8 * len(strict)
+    # a largest error 2 % beyond the limit, with the noise of its own test
+    near = [cell.enlarged(1.02 * limit) for cell in found for limit in (cell.limit_mm / 2, cell.limit_mm)]
+    print(f"2 % beyond the limit and conform: {100 * wrongly_conform(near):.1f} %")
+    assert wrongly_conform(near) < 0.05
     assert wrongly_conform(found) < 0.05
     assert wrongly_conform(judged) < 0.05
 

@@ -64,13 +64,21 @@ class ProvenCell:
         """Largest true error: what the limit is about."""
         return float(np.abs(self.true_error_mm).max())
 
-    def judged_against(self, limit_mm: float) -> ProvenCell:
-        """The same figures against another limit on length."""
-        limits = limits_on_length(limit_mm)
+    def judged_against(self, limit_mm: float, guard: str = "reference_and_repeat") -> ProvenCell:
+        """The same figures against another limit on length, or by another guard band."""
+        limits = limits_on_length(limit_mm).model_copy(update={"guard": guard})
         judged = judgements(limits, self.result.figures, self.result.lengths, self.cell.spheres)
         gaps = gaps_of(limits, self.result.figures, self.result.lengths, line_profile=False, flattery=())
         verdict, reasons = overall(judged, gaps)
         return replace(self, result=replace(self.result, limits=limits, judgements=judged, verdict=verdict, reasons=reasons), limit_mm=limit_mm)
+
+    def enlarged(self, largest_mm: float) -> ProvenCell:
+        """The same test of a system whose true errors are larger in proportion, the largest as given, against a limit that this exceeds by 2 %."""
+        true = self.true_error_mm * largest_mm / self.largest_mm
+        lengths = tuple(
+            replace(x, measured_mm=x.measured_mm + t - old) for x, t, old in zip(self.result.lengths, true, self.true_error_mm, strict=True)
+        )
+        return replace(self, result=replace(self.result, lengths=lengths), true_error_mm=true).judged_against(largest_mm / 1.02)
 
     @property
     def line(self) -> str:

@@ -69,6 +69,34 @@ def test_the_expanded_uncertainty_holds_calibration_scatter_and_reference(sessio
     assert large.test_standard_uncertainty_mm == small.test_standard_uncertainty_mm
 
 
+def test_the_uncertainty_of_a_diameter_holds_calibration_scatter_and_certificate(session: Session) -> None:
+    small, large = (verify(replace(SYSTEM, sigma_of_scale=sigma), [session], limits=WIDE).sphere_uncertainties["A"] for sigma in (1e-12, 1e-3))
+    assert small.diameter_calibration_mm < 1e-9
+    # a scale of the base is one of the diameter
+    assert large.diameter_calibration_mm == pytest.approx(1e-3 * 38.1, rel=0.01)
+    parts = (large.diameter_reference_mm, large.diameter_repeat_mm, large.diameter_calibration_mm)
+    assert large.diameter_expanded_mm == pytest.approx(2 * np.linalg.norm(parts))
+    sphere = verify(SYSTEM, [session], limits=WIDE).to_json_dict()["spheres"]
+    assert isinstance(sphere, dict)
+    assert {"diameter_expanded_uncertainty_mm", "form_expanded_uncertainty_mm", "uncertainty"} <= sphere["A"].keys()
+
+
+def test_the_limits_choose_what_the_guard_band_holds(session: Session) -> None:
+    """On the system's error, repeats count; on the values of this test, the artefact alone."""
+    usual, values = (verify(SYSTEM, [session], limits=WIDE.model_copy(update={"guard": guard})) for guard in ("reference_and_repeat", "reference"))
+    for a, b in zip(usual.judgements, values.judgements, strict=True):
+        assert (a.quantity, a.value_mm) == (b.quantity, b.value_mm)
+        assert b.standard_uncertainty_mm < a.standard_uncertainty_mm
+    length = values.lengths[0]
+    assert values.judgements[1].standard_uncertainty_mm == length.reference_standard_uncertainty_mm
+    assert usual.judgements[1].standard_uncertainty_mm == length.test_standard_uncertainty_mm
+    assert "artefact alone" in str(values.to_json_dict()["decision_rule"])
+    assert "artefact and repeatability" in str(usual.to_json_dict()["decision_rule"])
+    # a choice that nobody made is not written, so that old files keep their digests
+    assert "guard" not in WIDE.model_dump()
+    assert WIDE.model_copy(update={"guard": "reference"}).model_dump()["guard"] == "reference"
+
+
 def test_the_radius_offsets_uncertainty_moves_centres_as_a_refit_does(session: Session) -> None:
     """First order against the difference of two fits with other radii."""
     step = 1e-3
@@ -195,8 +223,6 @@ def test_cells_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     two = record_session(tmp_path / "two", load_cell(other.path), np.random.default_rng(10), shots_per_sphere=2)
     with pytest.raises(DataError, match="different names"):
         verify(SYSTEM, [one, two])
-
-
 
 
 def test_a_sphere_moved_between_sessions_under_one_name_is_refused(tmp_path: Path) -> None:
