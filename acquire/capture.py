@@ -44,7 +44,18 @@ from acquire.motion import RobotUnsettled, halt, read_safely
 from acquire.plan import Plan, PlannedPose
 from acquire.session import SessionWriter
 from acquire.way import way_of
-from drivers.errors import CameraError, CameraTimeout, MotionRefused, RobotError, RobotNotReached, SettingsError, SpherecalError
+from drivers.errors import (
+    CameraError,
+    CameraTimeout,
+    ChannelTaken,
+    MotionRefused,
+    MotorsOff,
+    NotInRemoteControl,
+    RobotError,
+    RobotNotReached,
+    SettingsError,
+    SpherecalError,
+)
 from drivers.kinematics.mdh import RobotModel
 from drivers.protocols import Devices, stop_after
 
@@ -304,5 +315,7 @@ class _Run:
 
 
 def _is_of_the_pose(error: MotionRefused | RobotUnsettled | CameraError) -> bool:
-    """Whether another pose may well go better."""
-    return not isinstance(error, CameraError) or error.retryable
+    """Whether another pose may well go better; not where nobody may move the robot at all, or the camera is gone."""
+    if isinstance(error, CameraError):
+        return error.retryable
+    return not isinstance(error, NotInRemoteControl | MotorsOff | ChannelTaken)

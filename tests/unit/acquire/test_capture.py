@@ -40,8 +40,11 @@ from drivers.errors import (
     CameraMisconfigured,
     CameraNotReached,
     CameraTimeout,
+    ChannelTaken,
     MotionInterrupted,
     MotionRefused,
+    MotorsOff,
+    NotInRemoteControl,
     RobotNotReached,
     RobotTimeout,
     SafetyStop,
@@ -258,6 +261,20 @@ def test_a_robot_that_refuses_everything_ends_the_run(bench: Bench) -> None:
     bench.robot.refused = [pose.joints_rad for pose in plan.poses]
     with pytest.raises(MotionRefused):
         bench.run(plan)
+
+
+@pytest.mark.parametrize("kind", [NotInRemoteControl, MotorsOff, ChannelTaken])
+def test_a_robot_that_nobody_may_move_ends_the_run_at_once(bench: Bench, kind: type[MotionRefused]) -> None:
+    """It is not the pose's fault: no pose is written off for it."""
+
+    def refuse(joints_rad: object, *, speed_rad_s: float) -> None:
+        del joints_rad, speed_rad_s
+        raise kind("somebody else is the master")
+
+    bench.robot.start_move = refuse  # type: ignore[assignment]
+    with pytest.raises(kind):
+        bench.run(fake_plan(5))
+    assert read_session(bench.folder).shots == ()
 
 
 def test_a_stuck_motion_is_stopped_at_its_deadline(bench: Bench) -> None:
