@@ -8,6 +8,7 @@ divide between them (METHOD.md 3), and without that freedom their priors would m
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -40,25 +41,46 @@ class Datum:
     """Which base frame the results are in."""
 
     kind: str
-    """`nominal_robot`: best fit to it; `controller`: the robot is taken as it reports."""
+    """`nominal_robot`: best fit to it; `controller`: the robot is taken as it reports; `calibration`: best fit to an earlier one's
+    robot; `spheres`: best fit of sphere centres to where an earlier one had them."""
     base_from_solver: FloatArray
     """(4, 4) from the solver's own base to the stated one."""
     references: References
-    """Where the fit was made; no poses for `controller`."""
+    """Where the fit was made; no poses for `controller`. With `spheres`: views of the work volume."""
+    like: str = ""
+    """Identity of the earlier calibration whose base this is."""
+    spheres: tuple[str, ...] = ()
+    """Names of those that hold the base."""
+    motion: FloatArray | None = None
+    """(6, p) with `spheres`: left twist of the solver's base per parameter of robot, hand-eye, camera and deflection."""
+    noise: FloatArray | None = None
+    """(6, 6) with `spheres`: covariance of that twist by what moves with no parameter, the noise of the shots."""
 
 
 def nominal_robot_datum(
     model: RobotModel, link_twists: FloatArray, over: References, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
 ) -> Datum:
     """Best fit of the calibrated robot, deflected by its terms, to the nominal one."""
+    return best_fit_datum(model, link_twists, over, lambda joints_rad: mdh.base_from_flange(model, joints_rad), terms, terms_rad)
+
+
+def best_fit_datum(
+    model: RobotModel,
+    link_twists: FloatArray,
+    over: References,
+    wanted: Callable[[FloatArray], FloatArray],
+    terms: tuple[RobotTerm, ...] = (),
+    terms_rad: FloatArray | None = None,
+) -> Datum:
+    """Best fit of the calibrated robot, deflected by its terms, to flange poses (k, 4, 4) wanted at axis angles (k, n)."""
     ordered, points = over.joints_rad[np.lexsort(over.joints_rad.T)], over.points_in_flange_mm
     joints = ordered[np.unique(np.linspace(0, len(ordered) - 1, min(MAX_REFERENCES, len(ordered))).round().astype(int))]
     deflection = None if terms_rad is None else deflection_rad(terms, terms_rad, model, joints)
-    nominal, solved = mdh.base_from_flange(model, joints), mdh.base_from_flange(model, joints, link_twists, deflection)
+    target, solved = _carried(wanted(joints), points), mdh.base_from_flange(model, joints, link_twists, deflection)
     base_from_solver, flange_offset = np.eye(4), np.eye(4)
     for _ in range(_ROUNDS):
         moved = base_from_solver @ solved @ flange_offset
-        step = _fit_step(moved, points, (_carried(nominal, points) - _carried(moved, points)).reshape(-1, 1))[:, 0]
+        step = _fit_step(moved, points, (target - _carried(moved, points)).reshape(-1, 1))[:, 0]
         base_from_solver = se3.exp(step[:6]) @ base_from_solver
         flange_offset = flange_offset @ se3.exp(step[6:])
     return Datum("nominal_robot", base_from_solver, References(joints, points))
@@ -67,6 +89,21 @@ def nominal_robot_datum(
 def controller_datum() -> Datum:
     """The base that the controller reports its poses in."""
     return Datum("controller", np.eye(4), References(np.zeros((0, 0))))
+
+
+def base_motion(
+    datum: Datum, model: RobotModel | None, link_twists: FloatArray, n_between: int, terms: tuple[RobotTerm, ...], terms_rad: FloatArray
+) -> FloatArray:
+    """(6, p) left twist of the solver's base per parameter: link twists, `n_between` of hand-eye and camera, terms."""
+    if datum.motion is not None:
+        return datum.motion
+    of_robot, n_links = datum_jacobian(datum, model, link_twists, terms, terms_rad), link_twists.size
+    return np.concatenate([of_robot[:, :n_links], np.zeros((6, n_between)), of_robot[:, n_links:]], axis=1)
+
+
+def base_columns(points_in_base_mm: FloatArray) -> FloatArray:
+    """(..., 3, 6) motion of points (..., 3) per left twist of their base."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (*points_in_base_mm.shape, 3)), -se3.hat(points_in_base_mm)], axis=-1)
 
 
 def datum_jacobian(
@@ -93,7 +130,7 @@ def _fit_step(base_from_flange: FloatArray, points_in_flange_mm: FloatArray, wan
     """(12, k): left twist of the base, then right twist of the flange, that best cause motions (3 p m, k) of carried points."""
     points = _carried(base_from_flange, points_in_flange_mm)
     rotation = base_from_flange[:, None, :3, :3]
-    of_base = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape, 3)), -se3.hat(points)], axis=-1)
+    of_base = base_columns(points)
     of_flange = np.concatenate([np.broadcast_to(rotation, (*points.shape, 3)), -rotation @ se3.hat(points_in_flange_mm)], axis=-1)
     design = np.concatenate([of_base, of_flange], axis=-1).reshape(-1, 12)
     scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3] * 2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibrate.datum import Datum, datum_jacobian
+from calibrate.datum import Datum, base_motion
 from calibrate.external_points import ExternalPoints
 from calibrate.external_solve import rms_mm, rows_without_pose_noise
 from calibrate.problem import Problem, State
@@ -137,11 +137,12 @@ def external_result(
 
 
 def _frame(problem: Problem, state: State, datum: Datum, covariance: FloatArray, index: int) -> ExternalFrame:
-    """A frame in the stated base; that base follows link twists and terms of the arm, and the frame with it."""
+    """A frame in the stated base; that base follows the parameters, and the frame with it."""
     layout = problem.layout
     own = np.arange(layout.references.start + 6 * index, layout.references.start + 6 * index + 6)
-    used = np.concatenate([np.arange(layout.links.stop), np.arange(layout.terms.start, layout.terms.stop), own])
-    of_base = datum_jacobian(datum, problem.model, state.link_twists, problem.terms, state.terms_rad)
+    used = np.concatenate([np.arange(layout.n_geometric), own])
+    between = layout.terms.start - layout.links.stop
+    of_base = base_motion(datum, problem.model, state.link_twists, between, problem.terms, state.terms_rad)
     jacobian = se3.adjoint(datum.base_from_solver) @ np.concatenate([of_base, np.eye(6)], axis=1)
     return ExternalFrame(datum.base_from_solver @ state.base_from_reference[index], jacobian @ covariance[np.ix_(used, used)] @ jacobian.T)
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from acquire.cell import Cell, Limits
-from calibrate.datum import References, nominal_robot_datum
+from calibrate.datum import References
+from calibrate.datum_choice import DatumChoice, stated_datum
 from calibrate.datum_poses import datum_joints
 from calibrate.external_points import ExternalPoints
 from calibrate.external_result import external_names, external_result
@@ -73,6 +74,7 @@ def robot_alone_result(
     created_utc: str,
     software: str,
     began: float,
+    like: DatumChoice | None = None,
 ) -> Calibration:
     """The calibration of a solve on external points alone, with everything that a file must hold.
 
@@ -84,7 +86,7 @@ def robot_alone_result(
     if points is None or model is None:
         raise DataError("there are no external points", remedy="Give shots with reference, target and point_in_reference_mm.")
     over = References(datum_joints(model, cell.work_volume_box_mm, points.joints_rad))
-    datum = nominal_robot_datum(model, state.link_twists, over, problem.terms, state.terms_rad)
+    datum = stated_datum(like, problem, state, (), solved.solution.covariance, over)
     held_out, predicted = rms_mm(solved.held_out_mm), predicted_rms_mm(solved.solution)
     scale = max(1.0, (held_out / predicted) ** 2) if np.isfinite(held_out) else 1.0
     covariance, rank = solved.solution.covariance * scale, robot_rank(solved)

@@ -17,7 +17,8 @@ from calibrate.assemble import Assembled
 from calibrate.budget import ErrorBudget, error_budget
 from calibrate.camera_field import seen_cells
 from calibrate.clouds import Solution
-from calibrate.datum import controller_datum, nominal_robot_datum
+from calibrate.datum import controller_datum
+from calibrate.datum_choice import DatumChoice, stated_datum, without_axes
 from calibrate.datum_poses import datum_joints, datum_references
 from calibrate.design_cell import work_box_mm
 from calibrate.design_shots import Expectation
@@ -43,6 +44,7 @@ from drivers.kinematics.se3 import FloatArray
 if TYPE_CHECKING:
     from calibrate.solve import Solved
 
+
 def make_result(
     solved: Solved,
     *,
@@ -56,16 +58,13 @@ def make_result(
     created_utc: str,
     software: str,
     began: float,
+    like: DatumChoice | None = None,
 ) -> Calibration:
-    """The calibration of a solve, with everything that a file must hold."""
+    """The calibration of a solve, with everything that a file must hold; in the base of an earlier one where `like` names it."""
     assembled, solution, problem = solved.assembled, solved.solution, solved.assembled.problem
     state = solution.state
     has_joints = problem.model is not None and problem.joints_rad is not None
-    datum = controller_datum()
     joints, used = _all_joints(problem), problem.n_shots + (0 if problem.external is None else problem.external.n_shots)
-    if problem.model is not None and joints is not None:
-        over = datum_references(cell, problem.model, state.flange_from_camera, state.centres_in_base_mm, joints)
-        datum = nominal_robot_datum(problem.model, state.link_twists, over, problem.terms, state.terms_rad)
     trained = predict(problem, state)
     line_profile = not problem.along_sight
     held_out_rms = solved.held_out.radial_rms_mm if line_profile else solved.held_out.centre_rms_mm
@@ -79,6 +78,12 @@ def make_result(
     identifiability = identifiability_of(problem, solution)
     names = assembled.sphere_names
     covariance = solution.covariance * scale
+    datum = controller_datum()
+    if problem.model is not None and joints is not None:
+        over = datum_references(cell, problem.model, state.flange_from_camera, state.centres_in_base_mm, joints)
+        datum = stated_datum(like, problem, state, names, covariance, over)
+    elif like is not None:
+        raise without_axes()
     result = Calibration(
         id="",
         method=method,

@@ -20,7 +20,7 @@ from calibrate.budget import ErrorBudget
 from calibrate.camera_error import CameraError
 from calibrate.camera_field import SHAPE as SEEN_SHAPE
 from calibrate.camera_field import CameraField, SeenCells, camera_field, correction_mm
-from calibrate.datum import Datum, datum_jacobian, link_columns, term_columns, twist_columns
+from calibrate.datum import Datum, base_columns, base_motion, link_columns, term_columns, twist_columns
 from calibrate.external_result import ExternalResult
 from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
@@ -240,22 +240,22 @@ class Calibration:
         if self.model is not None:
             q = np.broadcast_to(np.asarray(joints_rad, dtype=np.float64), (len(points), self.model.n_joints))
             frames = self._chain(self.model, q)
-            moved = link_columns(self.link_twists, frames, in_solver_base)
-            rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(in_solver_base)], axis=-1)
-            of_base = rigid @ self._base_motion()
-            blocks.append(moved + of_base[..., : self.link_twists.size])
+            blocks.append(link_columns(self.link_twists, frames, in_solver_base))
         blocks.append(twist_columns(flange, in_solver_base))
         basis = self.camera_error.basis(points)
         blocks.append(base_from_camera[:, :3, :3][:, :, self.camera_error.axis] * basis[:, None, :])
         if self.model is not None and self.terms:
-            yielded = term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base)
-            blocks.append(yielded + of_base[..., self.link_twists.size :])
-        return np.asarray(self.datum.base_from_solver[:3, :3] @ np.concatenate(blocks, axis=-1))
+            blocks.append(term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base))
+        moved = np.concatenate(blocks, axis=-1)
+        if self.model is not None:
+            moved += base_columns(in_solver_base) @ self._base_motion()
+        return np.asarray(self.datum.base_from_solver[:3, :3] @ moved)
 
     def _base_motion(self) -> FloatArray:
-        """(6, p) how the stated base follows link twists and terms; two threads may work it out at once, to the same end."""
+        """(6, p) how the stated base follows the parameters; two threads may work it out at once, to the same end."""
         if "base_motion" not in self._worked_out:
-            self._worked_out["base_motion"] = datum_jacobian(self.datum, self.model, self.link_twists, self.terms, self.terms_rad)
+            between = 6 + len(self.camera_mm)
+            self._worked_out["base_motion"] = base_motion(self.datum, self.model, self.link_twists, between, self.terms, self.terms_rad)
         return self._worked_out["base_motion"]
 
     def to_json_dict(self) -> dict[str, object]:
@@ -312,7 +312,12 @@ class Calibration:
     def _shot_covariance(self, points: FloatArray, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None) -> FloatArray:
         flange = np.broadcast_to(self._flange(joints_rad, base_from_flange, len(points)), (len(points), 4, 4))
         pose, point = self.noise_covariances_mm2(points, flange)
-        return pose + point
+        if self.datum.noise is None:
+            return pose + point
+        in_base = se3.apply(flange @ self.flange_from_camera, self.corrected_points_in_camera_mm(points))
+        base = self.datum.base_from_solver
+        turned = base[:3, :3] @ base_columns(se3.apply(se3.inverse(base), in_base))
+        return pose + point + turned @ self.datum.noise @ np.swapaxes(turned, -1, -2)
 
     def _flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:
         return self.datum.base_from_solver @ self._solver_flange(joints_rad, base_from_flange, n_points)

@@ -179,19 +179,27 @@ def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind
 
 
 def _datum_data(datum: Datum) -> dict[str, object]:
-    return {
+    data: dict[str, object] = {
         "kind": datum.kind,
         "base_from_solver": datum.base_from_solver,
         "reference_joints_rad": _rows(datum.references.joints_rad),
         "reference_points_in_flange_mm": datum.references.points_in_flange_mm,
     }
+    if datum.like:
+        data["like"] = datum.like
+    if datum.motion is not None and datum.noise is not None:
+        data |= {"spheres": list(datum.spheres), "motion_rows": _rows(datum.motion), "noise_rows": _rows(datum.noise)}
+    return data
 
 
 def _datum(data: Mapping[str, object], file: str) -> Datum:
     # older files compared the flange's own corners
     points = _array(data["reference_points_in_flange_mm"]) if "reference_points_in_flange_mm" in data else CORNERS_MM
     base_from_solver = _rigid(data["base_from_solver"], file, "datum.base_from_solver")
-    return Datum(str(data["kind"]), base_from_solver, References(_from_rows(data["reference_joints_rad"]), points.reshape(-1, 3)))
+    references = References(_from_rows(data["reference_joints_rad"]), points.reshape(-1, 3))
+    motion, noise = (_from_rows(data[key]) if key in data else None for key in ("motion_rows", "noise_rows"))
+    spheres = tuple(str(name) for name in _sequence(data.get("spheres", [])))
+    return Datum(str(data["kind"]), base_from_solver, references, str(data.get("like", "")), spheres, motion, noise)
 
 
 def _hand_eye(value: object) -> str:

@@ -20,6 +20,7 @@ from calibrate.camera_error import CameraError, NoCameraError, camera_error_mode
 from calibrate.camera_misfit import CameraMisfit, misfit_of
 from calibrate.centres import cross_validate_centres, require_centres, solve_centres
 from calibrate.clouds import Solution, solve_clouds, thinned
+from calibrate.datum_choice import DatumChoice
 from calibrate.distinct_views import held_by_priors, is_starved
 from calibrate.external_points import ExternalShot
 from calibrate.external_solve import held_out_errors, joined_by_external, solve_robot_alone, without_spoiled
@@ -67,6 +68,8 @@ class CalibrationSettings:
     robot_terms: str = "auto"
     """Terms of the arm beyond link twists: auto estimates those that held-out shots want, none leaves them all considered."""
     priors: Priors = field(default_factory=Priors)
+    datum: DatumChoice | None = None
+    """Whose base results are stated in; the nominal robot's if None."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +137,7 @@ def _calibrate(sessions: Sequence[Session], settings: CalibrationSettings) -> Ca
         created_utc=_now_utc(),
         software=_software(),
         began=began,
+        like=settings.datum,
     )
 
 
@@ -160,6 +164,7 @@ def _calibrate_robot_alone(
         created_utc=_now_utc(),
         software=_software(),
         began=began,
+        like=settings.datum,
     )
 
 

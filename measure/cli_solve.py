@@ -15,6 +15,7 @@ from measure.cli_run import AsJson, Debug, Quiet, command
 if TYPE_CHECKING:
     from acquire.centres import CentreRow
     from calibrate import Calibration
+    from calibrate.datum_choice import DatumChoice
     from measure.console import Console
 
 
@@ -108,6 +109,12 @@ def calibrate(
     robot_terms: Annotated[
         ArmTerms, typer.Option("--robot-terms", help="Terms of the arm beyond link twists: those that held-out shots want, or none.")
     ] = ArmTerms.auto,
+    datum: Annotated[
+        Path | None, typer.Option("--datum", metavar="CALIBRATION", help="State results in this earlier calibration's base, robot laid on robot.")
+    ] = None,
+    datum_spheres: Annotated[
+        str, typer.Option("--datum-spheres", metavar="A,B,C", help="With --datum: three or more spheres that have not moved hold the base instead.")
+    ] = "",
     history: HistoryPlace = None,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -124,7 +131,9 @@ def calibrate(
         require_writable(out)
         read = [read_session(folder) for folder in sessions]
         with run.console.progress("calibrating"):
-            settings = CalibrationSettings(camera_error=camera_error.value, method=method.value, robot_terms=robot_terms.value)
+            settings = CalibrationSettings(
+                camera_error=camera_error.value, method=method.value, robot_terms=robot_terms.value, datum=_datum_choice(datum, datum_spheres)
+            )
             calibration = calibrate_sessions(read, settings)
         former = save_calibration(calibration, out)
         if former is not None:
@@ -136,6 +145,19 @@ def calibrate(
         run.console.say(f"written to {out}; prove it on other shots: spherecal verify {out} SESSION")
         kept = record_calibration(place_of(history, out), calibration, out, run.console.note)
         run.finish({"method": method.value, **calibration.to_json_dict(), "out": out, "history": kept}, verdict=calibration.verdict)
+
+
+def _datum_choice(earlier: Path | None, spheres: str) -> DatumChoice | None:
+    from calibrate import Calibration
+    from calibrate.datum_choice import DatumChoice
+    from drivers.errors import SettingsError
+
+    if earlier is not None:
+        return DatumChoice(Calibration.load(earlier), tuple(name.strip() for name in spheres.split(",") if name.strip()))
+    if spheres:
+        remedy = "Add --datum CALIBRATION, which tells where they stood."
+        raise SettingsError("spheres alone do not tell where the base is", where="--datum-spheres", remedy=remedy)
+    return None
 
 
 def save_calibration(calibration: Calibration, out: Path) -> Path | None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from acquire.cell import Cell
+from calibrate.datum import Datum
 from calibrate.result import Calibration, ShotResult
 from drivers.kinematics.se3 import FloatArray
 from drivers.registry import untried_drivers
@@ -15,7 +16,13 @@ from measure.report_page import CalibrationFacts, ShotResidual
 _DATUM_TEXTS = {
     "nominal_robot": "base = best fit of the calibrated to the nominal robot over the work volume",
     "controller": "base = as the controller reports it",
+    "calibration": "base = that of the earlier calibration {like}: best fit to its robot over the work volume",
+    "spheres": "base = that of the earlier calibration {like}: spheres {spheres} stand where they stood",
 }
+
+
+def _datum_text(datum: Datum) -> str:
+    return _DATUM_TEXTS.get(datum.kind, datum.kind).format(like=datum.like[:12], spheres=", ".join(datum.spheres))
 
 
 def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: Mapping[str, str] | None = None) -> CalibrationFacts:
@@ -43,7 +50,7 @@ def facts_of(calibration: Calibration, cell: Cell | None = None, session_names: 
         train_rms_mm=statistics.train_rms_mm,
         cross_validated_rms_mm=statistics.cross_validated_rms_mm,
         radius_offset_mm=calibration.radius_offset_mm,
-        datum=_DATUM_TEXTS.get(calibration.datum.kind, calibration.datum.kind),
+        datum=_datum_text(calibration.datum),
         simulated=_is_simulated(calibration, cell),
         identity=dict(_identity(calibration)) | dict(_artefacts(cell)),
         shots=tuple(_residual(shot) for shot in calibration.shots),
