@@ -66,8 +66,8 @@ _ROBOT_MODES = {
 _RUNTIMES = {0: "STOPPING", 1: "STOPPED", 2: "PLAYING", 3: "PAUSING", 4: "PAUSED", 5: "RESUMING"}
 _RUNNING, _PLAYING, _NORMAL = 7, 2, (1, 2)
 _SAME_TOOL_MM, _SAME_TOOL_RAD = 1e-3, 1e-6
-# a UR's axes turn twice round at most; lengths of a pose are in m, its rotation vector in rad
-_LARGEST_RAD, _LARGEST_RAD_S, _LARGEST_POSE = 13.0, 10.0, 100.0
+# a UR's axes turn twice round at most; lengths of a pose are in m, its rotation vector in rad; simulated arms may be 1000 times as fast
+_LARGEST_RAD, _LARGEST_RAD_S, _LARGEST_POSE = 13.0, 1e4, 100.0
 _LOOK = "Look at the pendant, then continue with --resume."
 
 
