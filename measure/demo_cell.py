@@ -28,7 +28,7 @@ PLACED_WITHIN_MM = 2.0
 _BAR_MM = 500.0
 # middle and direction of the bar in its three orientations
 _BARS = {("A", "B"): ((880, 0, 220), (0, 1, 0)), ("C", "D"): ((900, 60, 320), (1, 0.1, 0)), ("E", "F"): ((920, -20, 360), (-0.1, 0.55, 0.83))}
-_PLATE = {"G": (720.0, -260.0, 330.0), "H": (1060.0, -190.0, 200.0), "I": (1030.0, 240.0, 470.0), "J": (740.0, 210.0, 180.0)}
+_PLATE = {"G": (720.0, -260.0, 330.0), "H": (1060.0, -190.0, 200.0), "I": (1050.0, 255.0, 480.0), "J": (740.0, 210.0, 180.0)}
 
 CALIBRATION_SPHERES = tuple(name for pair in _BARS for name in pair)
 VERIFICATION_SPHERES = tuple(_PLATE)

@@ -151,6 +151,7 @@ def calibrated(volume: VolumeCell, shots: Observations, settings: CalibrationSet
             created_utc="2026-01-01T00:00:00Z",
             software="tests",
             began=0.0,
+            like=settings.datum,
         )
 
 
