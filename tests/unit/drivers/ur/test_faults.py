@@ -155,6 +155,13 @@ def test_a_command_whose_confirmation_is_lost_is_not_sent_again(controller: Fake
     time.sleep(0.3)
     assert controller.n_motions() == count + 1
     assert stands(controller)
+    # the command still lies in the controller's registers: the next script must not find it there
+    controller.clear()
+    robot.open()
+    here = robot.read_state().joints_rad
+    assert here is not None
+    list(move(robot, here + 0.02, FAST))
+    assert controller.n_motions() == count + 2
 
 
 def test_ctrl_c_while_a_reading_is_waited_for_stops_the_robot(controller: FakeUr, robot: UrRobot, monkeypatch: pytest.MonkeyPatch) -> None:
