@@ -111,6 +111,8 @@ def _artefacts(cell: Cell | None) -> Iterator[tuple[str, str]]:
     for name, sphere in cell.spheres.items():
         certificate = f", certificate: {sphere.certificate}" if sphere.certificate else ""
         yield f"sphere {name}", f"diameter {sphere.diameter_mm:g} mm, U {sphere.expanded_uncertainty_mm:g} mm{certificate}"
+    for length in cell.lengths:
+        yield f"length {'-'.join(length.between)}", f"{length.length_mm:g} mm, U {length.expanded_uncertainty_mm:g} mm"
 
 
 def _identity(calibration: Calibration) -> Iterator[tuple[str, str]]:

@@ -157,7 +157,8 @@ def _grid(cells: list[list[Flowable]], widths: Sequence[float], *, head: bool) -
     from reportlab.platypus import TableStyle
 
     grid = Grid(cells, colWidths=list(widths), repeatRows=1 if head else 0, hAlign="LEFT")
-    lines = [("LINEBELOW", (0, 0), (-1, -1), 0.5, _LINE), ("VALIGN", (0, 0), (-1, -1), "TOP"), ("LEFTPADDING", (0, 0), (0, -1), 0)]
+    lines = [("LINEBELOW", (0, 0), (-1, -1), 0.5, _LINE), ("VALIGN", (0, 0), (-1, -1), "TOP")]
+    lines += [("LEFTPADDING", (0, 0), (0, -1), 0), ("LEFTPADDING", (1, 0), (-1, -1), 3), ("RIGHTPADDING", (0, 0), (-1, -1), 3)]
     grid.setStyle(TableStyle([*lines, ("TOPPADDING", (0, 0), (-1, -1), 2), ("BOTTOMPADDING", (0, 0), (-1, -1), 2)]))
     return grid
 
@@ -187,7 +188,7 @@ def _table(table: Table) -> Flowable:
     heads = [_text(t, _style("head", size - 0.8, colour=_SOFT, bold=True, right=r)) for t, r in zip(table.heads, right, strict=True)]
     cells = [[_text(t, _style("cell", size, after=0, right=r)) for t, r in zip(row, right, strict=True)] for row in table.rows]
     # columns as wide as what they hold, within reason: words wrap, figures do not
-    weight = [min(max(len(row[i]) for row in (table.heads, *table.rows)), 60) + 2 for i in range(len(table.heads))]
+    weight = [min(max(len(row[i]) for row in (table.heads, *table.rows)), 60) + 3 for i in range(len(table.heads))]
     return _grid([heads, *cells], [_WIDTH_PT * w / sum(weight) for w in weight], head=True)
 
 

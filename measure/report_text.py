@@ -200,6 +200,7 @@ def identity_of(facts: CalibrationFacts, verification: VerifyResult | None) -> t
     lines = [("cell", facts.cell_name), ("calibration", facts.id), *facts.identity.items()]
     if verification is not None:
         lines += [(f"verification session {s.name}", s.digest) for s in verification.sessions]
+        lines += verification.conditions
         lines.append(("procedure", SHAPED_ON))
     return tuple(lines)
 

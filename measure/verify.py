@@ -31,6 +31,7 @@ from drivers.kinematics.se3 import FloatArray
 from measure.decision import overall
 from measure.length_uncertainty import diameter_standard_uncertainty_mm
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
+from measure.proof.conditions import conditions_of
 from measure.proof.external import external_figures, judgeable, known_external
 from measure.proof.external_lengths import external_gaps, external_lengths
 from measure.proof.judging import gaps_of, judgements, sphere_uncertainties
@@ -91,6 +92,7 @@ def verify(
         before=before,
         before_length_errors_mm={} if before is None else _length_errors(before, artefact.lengths),
         reasons=(*found.reasons, *dict.fromkeys(marks), *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
+        conditions=conditions_of(sessions, artefact.spheres, artefact.lengths),
         seconds=time.perf_counter() - began,
     )
 

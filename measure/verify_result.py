@@ -63,6 +63,8 @@ class VerifyResult:
     """External reference points, told beside the spheres; judged by the lengths between them where no sphere was seen."""
     sphere_uncertainties: Mapping[str, SphereUncertainty] = field(default_factory=dict)
     """Of diameter and form, by the sphere's name; empty where only the views' own figures are wanted."""
+    conditions: tuple[tuple[str, str], ...] = ()
+    """When and how warm it was, and the certified values with their U, in words; empty for shots in memory."""
     maps: ResidualMaps | None = field(default=None, repr=False)
     """What the report draws of the points."""
 
@@ -124,6 +126,7 @@ class VerifyResult:
             "judgements": [_judgement_json(j) for j in self.judgements],
             "decision_rule": self.decision_rule,
             "procedure": SHAPED_ON,
+            "conditions": dict(self.conditions),
             "held_out": self.held_out,
             **({} if self.held_out else {"remark": TRAINING_REMARK}),
             "calibration": self.calibration_id,

@@ -120,6 +120,27 @@ def test_it_says_what_was_found(calibration: Calibration, verification: VerifyRe
     assert "none 0.200, pillow 0.060" in text
 
 
+def test_training_data_are_told_on_every_sheet_of_paper(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
+    """The head of a table that holds the whole page stands on each; without training data there is none."""
+    pages = [
+        write_report(tmp_path / f"{held_out}.html", calibration, replace(verification, held_out=held_out)).read_text() for held_out in (True, False)
+    ]
+    body = [page[page.index("<body>") :] for page in pages]
+    assert [page.count('<div class="marked"><p class="every-page">TRAINING DATA USED') for page in body] == [0, 1]
+    assert "table-header-group; break-inside: avoid" in pages[1]
+
+
+def test_a_page_is_no_larger_than_its_pictures_need(calibration: Calibration, verification: VerifyResult, tmp_path: Path) -> None:
+    """Maps of thousands of fields are pictures: as drawn fields they were two thirds of a page of a megabyte."""
+    text = write_report(tmp_path / "report.html", calibration, verification).read_text()
+    figures = re.findall(r"<figure.*?</figure>", text, re.DOTALL)
+    assert len(figures) >= 8
+    assert max(len(figure) for figure in figures) < 120_000
+    form = next(figure for figure in figures if "Form of the spheres" in figure)
+    assert "<image" in form
+    assert form.count("<path") < 100
+
+
 def test_text_from_files_cannot_become_markup(calibration: Calibration, cell: Cell, tmp_path: Path) -> None:
     evil = replace(without_pictures(calibration), cell_name="<script>alert(1)</script>")
     path = write_report(tmp_path / "report.html", evil, cell=cell)

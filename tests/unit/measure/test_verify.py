@@ -81,6 +81,15 @@ def test_the_uncertainty_of_a_diameter_holds_calibration_scatter_and_certificate
     assert {"diameter_expanded_uncertainty_mm", "form_expanded_uncertainty_mm", "uncertainty"} <= sphere["A"].keys()
 
 
+def test_the_conditions_of_a_test_are_told(session: Session) -> None:
+    told = dict(verify(SYSTEM, [session], limits=WIDE).conditions)
+    times = sorted(str(shot.time_utc) for shot in session.shots)
+    assert told["verification shots taken"] == f"{times[0]} to {times[-1]}"
+    assert told["verification temperatures"] == "none was recorded"
+    assert told["verification sphere A"].startswith("diameter 38.1000 mm, U 0.00")
+    assert "mm, U 0.00" in told["verification length A-B"]
+
+
 def test_the_limits_choose_what_the_guard_band_holds(session: Session) -> None:
     """On the system's error, repeats count; on the values of this test, the artefact alone."""
     usual, values = (verify(SYSTEM, [session], limits=WIDE.model_copy(update={"guard": guard})) for guard in ("reference_and_repeat", "reference"))
