@@ -271,7 +271,7 @@ def test_a_robot_that_nobody_may_move_ends_the_run_at_once(bench: Bench, kind: t
         del joints_rad, speed_rad_s
         raise kind("somebody else is the master")
 
-    bench.robot.start_move = refuse  # type: ignore[assignment]
+    bench.robot.start_move = refuse  # type: ignore[method-assign]
     with pytest.raises(kind):
         bench.run(fake_plan(5))
     assert read_session(bench.folder).shots == ()
