@@ -19,8 +19,9 @@ from calibrate.identifiability import ANGLE_SCALE_MM, parameter_names
 from calibrate.normal import symmetric_inverse
 from calibrate.observations import RejectedShot
 from calibrate.provenance import identity_of, inputs_of
-from calibrate.result import Calibration, Statistics
+from calibrate.result import Calibration
 from calibrate.result_file import calibration_data
+from calibrate.result_parts import Statistics
 from calibrate.temperature import temperature_ranges_c
 from drivers.errors import DataError
 from drivers.files.session import Session

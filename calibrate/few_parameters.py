@@ -22,8 +22,9 @@ from calibrate.drift_causes import CAMERA, HAND_EYE, SHOT, SPHERE, causes_of, di
 from calibrate.observations import SphereShot
 from calibrate.problem import Problem, State, linearise_geometry
 from calibrate.quick_check import CheckResiduals, check_residuals, known_state, known_system
-from calibrate.result import Calibration, ShotResult
+from calibrate.result import Calibration
 from calibrate.result_file import calibration_data
+from calibrate.result_parts import ShotResult
 from calibrate.sums import shot_moments
 from drivers.errors import DataError
 from drivers.kinematics import se3

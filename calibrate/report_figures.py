@@ -30,8 +30,9 @@ from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
 from calibrate.provenance import identity_of, inputs_of
 from calibrate.rejection import unexplained
-from calibrate.result import Calibration, ShotResult, Statistics
+from calibrate.result import Calibration
 from calibrate.result_file import calibration_data
+from calibrate.result_parts import ShotResult, Statistics
 from calibrate.sources import artefact_covariance
 from calibrate.temperature import temperature_ranges_c
 from calibrate.validation import Prediction, predict, shot_centre_covariance_mm2

@@ -22,6 +22,7 @@ from calibrate.external_result import external_data, external_from_data
 from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot
+from calibrate.result_parts import ShotResult, Statistics
 from calibrate.robot_terms import RobotTerm
 from drivers.errors import FileError
 from drivers.files.disk import write_text_atomic
@@ -31,7 +32,7 @@ from drivers.kinematics.se3 import FloatArray
 from drivers.models import robot_model_data, robot_model_from_data
 
 if TYPE_CHECKING:
-    from calibrate.result import Calibration, ShotResult
+    from calibrate.result import Calibration
 
 FORMAT = "spherecal-calibration/1"
 _NOT_IN_ID = ("id", "created_utc", "software", "seconds")
@@ -130,8 +131,6 @@ def _fits_its_id(data: Mapping[str, object]) -> bool:
 
 
 def _calibration(data: dict[str, object], kind: type[_Kind], file: str) -> _Kind:
-    from calibrate.result import Statistics
-
     camera = _mapping(data["camera_error"])
     spheres = {name: _mapping(sphere) for name, sphere in _mapping(data["spheres"]).items()}
     datum, parameters = _mapping(data["datum"]), _mapping(data["parameters"])
@@ -226,8 +225,6 @@ def _shot_data(shot: ShotResult) -> dict[str, object]:
 
 
 def _shot(data: Mapping[str, object]) -> ShotResult:
-    from calibrate.result import ShotResult
-
     centre = data["centre_in_base_mm"]
     predicted = data["predicted_error_mm"]
     return ShotResult(

@@ -8,7 +8,8 @@ import numpy as np
 
 from acquire.cell import Cell
 from calibrate.datum import Datum
-from calibrate.result import Calibration, ShotResult
+from calibrate.result import Calibration
+from calibrate.result_parts import ShotResult
 from drivers.kinematics.se3 import FloatArray
 from drivers.registry import untried_drivers
 from measure.report_page import CalibrationFacts, ShotResidual

@@ -7,7 +7,8 @@ from dataclasses import asdict
 
 import numpy as np
 
-from calibrate.result import Calibration, ShotResult
+from calibrate.result import Calibration
+from calibrate.result_parts import ShotResult
 from measure.report_page import Table
 from measure.report_text import NOTHING
 from measure.verify_result import VerifyResult

@@ -12,7 +12,7 @@ from calibrate import Calibration
 from calibrate.camera_error import NoCameraError
 from calibrate.datum import References, controller_datum, nominal_robot_datum
 from calibrate.normal import NoiseModel
-from calibrate.result import Statistics
+from calibrate.result_parts import Statistics
 from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.kinematics.se3 import FloatArray

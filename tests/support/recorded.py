@@ -16,7 +16,8 @@ from calibrate.camera_error import PillowError
 from calibrate.datum import References, nominal_robot_datum
 from calibrate.normal import NoiseModel
 from calibrate.observations import RejectedShot, gather_observations
-from calibrate.result import Calibration, ShotResult, Statistics
+from calibrate.result import Calibration
+from calibrate.result_parts import ShotResult, Statistics
 from drivers.files.session import Session, read_session
 from drivers.files.yaml import dump_yaml
 from drivers.kinematics import mdh, se3
