@@ -75,22 +75,22 @@ def fit_feature(name: str, feature: Feature, cloud: PartCloud, others: Mapping[s
         DataError: too few points, or they leave it open.
     """
     shape = shape_of(feature, others)
-    rows = points_near(shape, cloud)
+    rows = points_near(shape, cloud, any_normal=isinstance(feature, CircleFeature | SlotFeature) and feature.use == "edge")
     if isinstance(feature, CircleFeature | SlotFeature) and feature.use == "edge":
         if not isinstance(shape, StadiumShape):  # what `shape_of` makes of an outline
             raise TypeError(type(shape))
         points, rows, spacing_mm = rim_points(shape, cloud.points_mm, rows, name)
-        fit = fit_shape(shape, FitPoints(points, np.ones(len(rows)), rows), name=name)
+        fit = fit_shape(shape, FitPoints(points, np.ones(len(rows)), rows, spacing_mm), name=name)
         # what moves the whole rim alike shows in no residual: half the spacing's width, as a rectangle
-        doubt = np.zeros_like(fit.covariance)
+        doubt = np.zeros_like(fit.noise_covariance)
         doubt[shape.names.index("radius"), shape.names.index("radius")] = spacing_mm**2 / 3
         # a rim is seen by whoever sees the surface round it
-        return replace(fit, covariance=fit.covariance + doubt, response=replace(fit.response, surface=None))
+        return replace(fit, noise_covariance=fit.noise_covariance + doubt, response=replace(fit.response, surface=None))
     return fit_shape(shape, FitPoints(cloud.points_mm[rows], cloud.weights[rows], rows, cloud.voxel_mm), name=name)
 
 
-def points_near(shape: Shape, cloud: PartCloud) -> IntArray:
-    """Rows of the cloud in a shape's region, whose normals agree where they are known."""
+def points_near(shape: Shape, cloud: PartCloud, *, any_normal: bool = False) -> IntArray:
+    """Rows of the cloud in a shape's region, whose normals agree where they are known, unless any will do."""
     low, high = box_of(shape)
     points = cloud.points_mm
     rows = np.flatnonzero((points[:, 0] > low[0]) & (points[:, 0] < high[0]))
@@ -99,7 +99,7 @@ def points_near(shape: Shape, cloud: PartCloud) -> IntArray:
         rows = rows[(column > low[axis]) & (column < high[axis])]
     local = se3.apply(shape.local_from_part, points[rows])
     rows, local = _subset(shape.near(local), rows, local)
-    if cloud.normals is not None and not (isinstance(shape, StadiumShape)) and len(rows):
+    if cloud.normals is not None and not any_normal and len(rows):
         gradient = shape.distances(np.zeros(len(shape.names)), local).gradient @ shape.local_from_part[:3, :3]
         agreement = np.abs(np.einsum("ni,ni->n", gradient, cloud.normals[rows]))
         with np.errstate(invalid="ignore"):

@@ -1,18 +1,18 @@
 """Robust least-squares fits, what their residuals say of the result, and how the result answers to errors of the cloud.
 
-A fit begins with Tukey's weights on a thinned set, whose scale the data gives, and ends as a plain least-squares fit of
-the points within 4 scales: what is reported is a least-squares element. A point of a fused cloud weighs what its raw
-points weigh together: voxels cut a noisy surface into layers, and only with those weights is the fit that of the raw
-points. For the same reason no mean of a voxel is rejected that lies within half a voxel of the surface.
+A fit begins with Tukey's weights on a thinned set, whose scale the data gives, and ends as a least-squares fit of all
+points, each by its chance of lying on the surface and not straying (`measure.inspecting.strays`). A point of a fused cloud
+weighs what its raw points weigh together: voxels cut a noisy surface into layers, and only with those weights is the fit
+that of the raw points. For the same reason the surface's noise is not taken as less than an eighth of a voxel.
 
-The covariance comes from the residuals summed over patches, so that what neighbours have in common is not averaged
-away (cluster-robust, K.-Y. Liang and S. L. Zeger, Biometrika 73, 1986), with Student's factor for the number of patches.
-What is common to a whole feature shows in no residual: for that a fit keeps its response to displacements of its patches
-(see `measure.inspecting.uncertainty`).
+What residuals tell of the result is kept in two parts: noise of single points, and what patches of neighbours have in
+common (`measure.inspecting.patches`), part of which the cloud's own errors explain. What is common to a whole feature
+shows in no residual: for that a fit keeps its response to displacements of its patches (`measure.inspecting.uncertainty`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,22 +22,21 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.coverage import Coverage, coverage_of, on_seen_sectors
-from measure.inspecting.patches import IntArray, PatchSums, patch_covariance, patches_of
+from measure.inspecting.patches import CELLS_ACROSS, COARSE_CELLS_ACROSS, Division, IntArray, PatchSums, Scatter, patches_of, scatters_of
+from measure.inspecting.robust import fit_step, robust_fit
 from measure.inspecting.shapes import ConeShape, Distances, Shape, StadiumShape
+from measure.inspecting.strays import Mixture
 
-_THINNED = 6_000
-_ROUNDS = 25
-_TUKEY = 4.685
 _CUT = 4.0
 _WIDER_FOR_RAW = 1.5
 _LAYERS = 4
+_CELLS_OF_WALLS = 12
+_CORE = 2.0
 _VOXELS = 0.5
 _SMALLEST_SCALE_MM = 1e-5
-_LONGEST_STEP_MM = 0.5
 _FEWEST_PER_PARAMETER = 5
 _LARGEST_TURN_RAD = 0.15
 _LOOK = "Look at alignment, nominal and search_mm, and whether the scans show the place."
-_MOST_CONDITION = 1e5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +52,11 @@ class Surface:
         """(n,) which points (n, 3) lie on it, in its region."""
         local = se3.apply(self.shape.local_from_part, in_part_mm)
         return np.asarray(self.shape.near(local) & (np.abs(self.shape.distances(self.params, local).residual_mm) <= self.limit_mm))
+
+    def distances(self, in_part_mm: FloatArray) -> Distances:
+        """Of points (n, 3); the gradient is in the frame of the part."""
+        found = self.shape.distances(self.params, se3.apply(self.shape.local_from_part, in_part_mm))
+        return found._replace(gradient=found.gradient @ self.shape.local_from_part[:3, :3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +82,10 @@ class Fit:
     shape: Shape
     params: FloatArray
     """(p,)."""
-    covariance: FloatArray
-    """(p, p) by what the residuals show."""
+    noise_covariance: FloatArray
+    """(p, p) by the noise of single points, and by what strays may pull."""
+    scatters: tuple[Scatter, ...]
+    """What groups of neighbours have in common, divided in several ways."""
     response: Response
     rms_mm: float
     """Of the residuals of the points used, by their weights."""
@@ -87,15 +93,29 @@ class Fit:
     """(n,) which points of the cloud those are."""
     n_rejected: int
     patch_residual_mm: FloatArray
-    """(K,) mean residual of each patch."""
+    """(K,) mean residual of each patch of the form, which are larger than those of the response."""
     patch_count: IntArray
     """(K,) points of each patch."""
     patch_jacobian: FloatArray
     """(K, p) mean of the residual's derivatives by the parameters."""
-    patch_normal: FloatArray
-    """(K, 3) mean of its derivatives by the point, frame of the part."""
+    patch_motion: FloatArray
+    """(K, K', 3) how that mean answers to displacements of the response's patches, the shape held."""
     coverage: Coverage | None = None
     """Of a round feature's circumference."""
+
+    def covariance(self, explained: Sequence[FloatArray] = ()) -> FloatArray:
+        """(p, p) by what the residuals show.
+
+        Args:
+            explained: (p, p) for each scatter, what known errors of the cloud make of it.
+        """
+        beyond = [scatter.beyond(explained[number] if explained else 0.0) for number, scatter in enumerate(self.scatters)]
+        if not beyond:
+            return self.noise_covariance
+        # of the variances that the divisions show the largest; correlations are those of the finest
+        sigma, finest = np.sqrt(np.max(beyond, axis=0)), self.scatters[0].observed
+        size = np.sqrt(np.maximum(np.diag(finest), 1e-300))
+        return np.asarray(self.noise_covariance + finest * np.outer(sigma / size, sigma / size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,43 +147,51 @@ def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
         DataError: too few points, or they leave the shape open.
     """
     local = se3.apply(shape.local_from_part, points.in_part_mm)
-    n_params, n_points = len(shape.names), int((points.weights > 0).sum())
-    if n_points < _FEWEST_PER_PARAMETER * n_params:
-        message = f"{n_points} points of the cloud lie where the feature should be, {_FEWEST_PER_PARAMETER * n_params} are needed"
-        raise DataError(message, where=name, remedy=_LOOK)
-    thinned = slice(None, None, max(1, len(local) // _THINNED))
-    robust, scale = _robust_start(shape, local[thinned], points.weights[thinned], points.voxel_mm, name)
-    kept = np.abs(shape.distances(robust, local).residual_mm) <= max(_CUT * scale, _VOXELS * points.voxel_mm)
+    _require_enough(int((points.weights > 0).sum()), shape, "lie where the feature should be", name)
+    least_sigma_mm = max(_VOXELS * points.voxel_mm / _CUT, _SMALLEST_SCALE_MM)
+    robust, mixture = robust_fit(shape, local, points.weights, least_sigma_mm, name)
+    chance = mixture.chances(shape.distances(robust, local).residual_mm)
+    kept = chance > 0.5
     kept[kept] = on_seen_sectors(shape, local[kept], robust)
     local, used = local[kept], points.taken(kept)
-    params = _least_squares(shape, local, used.weights, robust, name)
+    used = replace(used, weights=used.weights * _tapered(shape, local, points.voxel_mm))
+    _require_enough(len(local), shape, "make a surface where the feature should be", name)
+    params = _least_squares(shape, local, used.weights, robust, mixture, name)
     _require_near_nominal(shape, params, name)
-    found = _described(shape, params, local, used, len(kept) - len(local))
-    # what hangs on how far-off points are treated is not known better than that
-    return replace(found, covariance=found.covariance + np.outer(params - robust, params - robust))
+    chance = mixture.chances(shape.distances(params, local).residual_mm)
+    described = _described(shape, params, local, replace(used, weights=used.weights * chance), len(kept) - len(local))
+    # strays pull to one side: what a narrower look at the surface changes is not known better than that
+    core = np.abs(shape.distances(params, local).residual_mm) <= max(_CORE * mixture.sigma_mm, _VOXELS * points.voxel_mm)
+    pulled = fit_step(shape.distances(params, local[core]), used.weights[core], name)
+    return replace(described, noise_covariance=described.noise_covariance + np.outer(pulled, pulled))
 
 
-def _robust_start(shape: Shape, local: FloatArray, weights: FloatArray, voxel_mm: float, name: str) -> tuple[FloatArray, float]:
-    params = np.zeros(len(shape.names))
-    scale = np.inf
-    for _ in range(_ROUNDS):
-        found = shape.distances(params, local)
-        scale = max(_scale_of(found.residual_mm), _VOXELS * voxel_mm / _CUT, _SMALLEST_SCALE_MM)
-        share = np.clip(found.residual_mm / (_TUKEY * scale), -1.0, 1.0)
-        step = _step(found, weights * (1.0 - share**2) ** 2, name)
-        params = params + step
-        if np.abs(step).max() < 1e-3 * scale:
-            break
-    return params, max(_scale_of(shape.distances(params, local).residual_mm), _SMALLEST_SCALE_MM)
+def _tapered(shape: Shape, local: FloatArray, voxel_mm: float) -> FloatArray:
+    """(n,) weights that fade over the last voxel of a cone's ends.
+
+    Voxels cut a steep surface into steps, within each of which the means' residuals run from one sign to the other: a
+    region that ends within a step keeps a piece of it at full lever, 0.1 degrees of the angle for voxels of 0.5 mm.
+    """
+    if not isinstance(shape, ConeShape) or shape.half_angle_rad == 0.0 or voxel_mm == 0.0:
+        return np.ones(len(local))
+    return np.asarray(np.clip((shape.half_length_mm - np.abs(shape.along(local))) / min(voxel_mm, shape.half_length_mm / 2), 0.0, 1.0))
 
 
-def _least_squares(shape: Shape, local: FloatArray, weights: FloatArray, params: FloatArray, name: str) -> FloatArray:
+def _least_squares(shape: Shape, local: FloatArray, weights: FloatArray, params: FloatArray, mixture: Mixture, name: str) -> FloatArray:
     for _ in range(8):
-        step = _step(shape.distances(params, local), weights, name)
+        found = shape.distances(params, local)
+        step = fit_step(found, weights * mixture.chances(found.residual_mm), name)
         params = params + step
         if np.abs(step).max() < 1e-5:
             break
     return params
+
+
+def _require_enough(n_points: int, shape: Shape, where: str, name: str) -> None:
+    """A few strays lie near a plane that was not seen at all."""
+    needed = _FEWEST_PER_PARAMETER * len(shape.names)
+    if n_points < needed:
+        raise DataError(f"{n_points} points of the cloud {where}, {needed} are needed", where=name, remedy=_LOOK)
 
 
 def _require_near_nominal(shape: Shape, params: FloatArray, name: str) -> None:
@@ -173,32 +201,21 @@ def _require_near_nominal(shape: Shape, params: FloatArray, name: str) -> None:
         raise DataError("the points found near the nominal do not show the feature there", where=name, remedy=_LOOK)
 
 
-def _scale_of(residual_mm: FloatArray) -> float:
-    """Standard deviation about zero, by the median of sizes."""
-    return 1.4826 * float(np.median(np.abs(residual_mm)))
+def _patch_motion(gradient: FloatArray, weights: FloatArray, formed: IntArray, labels: IntArray) -> FloatArray:
+    """(K, K', 3) mean normal of each form patch, by the response patches that its points lie in."""
+    n_forms, n_patches = int(formed.max()) + 1, int(labels.max()) + 1
+    both = formed * n_patches + labels
+    sums = np.stack([np.bincount(both, column * weights, n_forms * n_patches) for column in gradient.T], axis=1)
+    whole = np.maximum(np.bincount(formed, weights, n_forms), 1e-12)
+    return np.asarray(sums.reshape(n_forms, n_patches, 3) / whole[:, None, None])
 
 
-def _step(found: Distances, weights: FloatArray, name: str) -> FloatArray:
-    weighted = found.jacobian * weights[:, None]
-    normal = weighted.T @ found.jacobian
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    if np.linalg.cond(normal / np.outer(size, size)) > _MOST_CONDITION**2:
-        raise DataError(
-            "the points leave the feature open: they cover too little of it",
-            where=name,
-            remedy="Scan more of the feature, or describe it by another one (a circle, a plane).",
-        )
-    step = -np.linalg.solve(normal, weighted.T @ found.residual_mm)
-    return np.asarray(step * min(1.0, _LONGEST_STEP_MM / max(float(np.abs(step).max()), 1e-12)))
+def response_patches(shape: Shape, in_part_mm: FloatArray) -> tuple[IntArray, float]:
+    """Patches (n,) of points (n, 3) that a fit's response is given by, and their size in mm.
 
-
-def _layers(shape: Shape, local: FloatArray) -> IntArray | None:
-    """(n,) which of the layers along its axis a point of a wall lies in; None where there is no wall."""
-    if not isinstance(shape, ConeShape | StadiumShape):
-        return None
-    z = local[:, 2]
-    edges = np.quantile(z, np.linspace(0, 1, _LAYERS + 1)[1:-1])
-    return np.unique(np.searchsorted(edges, z), return_inverse=True)[1].astype(np.int64)
+    Those of round walls are smaller: a wall turns away within a patch, and the views that see it change with it.
+    """
+    return patches_of(in_part_mm, _CELLS_OF_WALLS if isinstance(shape, ConeShape | StadiumShape) else CELLS_ACROSS)
 
 
 def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitPoints, n_rejected: int) -> Fit:
@@ -207,8 +224,13 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     weighted = found.jacobian * points.weights[:, None]
     # (n, p): what a residual does to the parameters
     gain = np.asarray(-np.linalg.solve(weighted.T @ found.jacobian, weighted.T).T, dtype=np.float64)
-    labels, size_mm = patches_of(points.in_part_mm)
-    patches = PatchSums(labels, points.weights)
+    labels, size_mm = response_patches(shape, points.in_part_mm)
+    formed = patches_of(points.in_part_mm)[0]
+    divisions = [Division.whole(formed), Division.whole(patches_of(points.in_part_mm, COARSE_CELLS_ACROSS)[0])]
+    if isinstance(shape, ConeShape | StadiumShape):
+        # what a whole rim has in common shows between layers alone
+        divisions.append(Division.layers(local[:, 2], _LAYERS, points.voxel_mm))
+    patches, forms = PatchSums(labels, points.weights), PatchSums(formed, points.weights)
     rms_mm = float(np.sqrt(np.average(found.residual_mm**2, weights=points.weights)))
     response = Response(
         centre_in_part_mm=patches.mean(points.in_part_mm),
@@ -221,14 +243,15 @@ def _described(shape: Shape, params: FloatArray, local: FloatArray, points: FitP
     return Fit(
         shape=shape,
         params=params,
-        covariance=patch_covariance(gain, found.residual_mm, points.in_part_mm, found.jacobian, _layers(shape, local)),
+        noise_covariance=(gain * found.residual_mm[:, None]).T @ (gain * found.residual_mm[:, None]),
+        scatters=scatters_of(gain, found.residual_mm, found.jacobian, gradient, labels, divisions),
         response=response,
         rms_mm=rms_mm,
         rows=points.rows,
         n_rejected=n_rejected,
-        patch_residual_mm=patches.mean(found.residual_mm[:, None])[:, 0],
-        patch_count=patches.counts,
-        patch_jacobian=patches.mean(found.jacobian),
-        patch_normal=patches.mean(gradient),
+        patch_residual_mm=forms.mean(found.residual_mm[:, None])[:, 0],
+        patch_count=forms.counts,
+        patch_jacobian=forms.mean(found.jacobian),
+        patch_motion=_patch_motion(gradient, points.weights, formed, labels),
         coverage=coverage_of(shape, local, params),
     )

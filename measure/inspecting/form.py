@@ -21,7 +21,7 @@ class Form:
     noise_variance_mm2: float
     """Of that difference, by the scatter within the two patches."""
     by_patch: FloatArray
-    """(K, 3) how that difference answers to displacements of the patches, the fit following them."""
+    """(K, 3) how that difference answers to displacements of the response's patches, the fit following them."""
 
 
 def form_of(fit: Fit) -> Form:
@@ -33,8 +33,7 @@ def form_of(fit: Fit) -> Form:
     low = enough[np.argmin(fit.patch_residual_mm[enough])]
     scatter = fit.rms_mm**2 * (1 / fit.patch_count[high] + 1 / fit.patch_count[low])
     by_patch = np.einsum("p,kpi->ki", fit.patch_jacobian[high] - fit.patch_jacobian[low], fit.response.by_patch)
-    by_patch[high] += fit.patch_normal[high]
-    by_patch[low] -= fit.patch_normal[low]
+    by_patch += fit.patch_motion[high] - fit.patch_motion[low]
     return Form(float(fit.patch_residual_mm[high] - fit.patch_residual_mm[low]), float(scatter), by_patch)
 
 

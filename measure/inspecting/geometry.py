@@ -34,6 +34,17 @@ class Element:
         """In another frame."""
         return replace(self, point_mm=se3.apply(new_from_old, self.point_mm), axis=new_from_old[:3, :3] @ self.axis)
 
+    def passing(self, nominal: Element) -> Element:
+        """An axis where it passes the nominal centre; a cone's diameter is the one there."""
+        slope = float(self.axis @ nominal.axis)
+        if self.kind not in AXES or abs(slope) < 0.1:
+            return self
+        along = float(nominal.axis @ (nominal.point_mm - self.point_mm)) / slope
+        diameter = self.diameter_mm
+        if diameter is not None and self.angle_deg is not None:
+            diameter += 2 * along * float(np.tan(np.radians(self.angle_deg / 2)))
+        return replace(self, point_mm=self.point_mm + along * self.axis, diameter_mm=diameter)
+
     def point_on(self, plane: Element) -> FloatArray:
         """The point itself, or where the axis meets a plane, brought into that plane along its normal."""
         point = self.point_mm

@@ -25,7 +25,7 @@ from measure.inspecting.quantities import Model, require_checks_fit
 from measure.inspecting.region import WIDER
 from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, Inspection
 from measure.inspecting.spec import InspectionSpec, ProfileCheck
-from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance
+from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance, residual_covariances
 from measure.inspecting.views import FieldSource
 
 _DATUM_ROUNDS = 3
@@ -228,7 +228,8 @@ def _covariances(
 
     if not responses:
         return JointCovariance(np.zeros((0, 0)), (np.zeros((0, 0)),), np.zeros(0)), {}
-    blocks = [block_diag(fit.covariance, np.array([[forms[name].noise_variance_mm2]])) for name, fit in fits.items()]
+    own = residual_covariances(list(fits.values()), responses, field)
+    blocks = [block_diag(covariance, np.array([[forms[name].noise_variance_mm2]])) for name, covariance in zip(fits, own, strict=True)]
     blocks += [fitted.covariance] if fitted else []
     everything = joint_covariance(responses, blocks, field, spec.surface.expanded_uncertainty_mm / 2)
     at_form = np.cumsum([len(fit.params) + 1 for fit in fits.values()], dtype=np.int64) - 1

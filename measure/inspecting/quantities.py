@@ -98,7 +98,7 @@ class Model:
 
     def nominal(self, names: Sequence[str]) -> dict[str, Element]:
         """Features as drawn."""
-        return {name: nominal_element(self.features[name], self.fits[name].shape) for name in names}
+        return {name: self._nominal(name) for name in names}
 
     def alignment(self) -> FloatArray:
         """(4, 4) what the datums still move the part by."""
@@ -128,6 +128,9 @@ class Model:
         result[:, columns] = np.array(rows).T
         return result
 
+    def _nominal(self, name: str) -> Element:
+        return nominal_element(self.features[name], self.fits[name].shape)
+
     def _columns(self, name: str) -> range:
         return range(self._start[name], self._start[name] + len(self.fits[name].params))
 
@@ -136,7 +139,8 @@ class Model:
             change = AS_FITTED
         if (name, change) not in self._aligned:
             aligned = self._alignment(change if self._moves_all(change) else AS_FITTED)
-            self._aligned[name, change] = self._element(name, change).moved(aligned)
+            # an axis has its place and a cone its diameter at the nominal centre of the part as aligned, not as it lay
+            self._aligned[name, change] = self._element(name, change).moved(aligned).passing(self._nominal(name))
         return self._aligned[name, change]
 
     def _moves_all(self, change: Change) -> bool:

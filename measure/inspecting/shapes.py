@@ -202,9 +202,15 @@ class ConeShape:
         Cut across the axis instead, noise along the rays would leave and enter at the two ends on opposite sides of the
         mantle, and a cone of 90 degrees would read 0.3 degrees wide at 0.08 mm of noise.
         """
+        out = np.hypot(points_mm[:, 0], points_mm[:, 1]) - self.radius_mm
+        off = out * np.cos(self.half_angle_rad) - points_mm[:, 2] * np.sin(self.half_angle_rad)
+        return np.asarray((np.abs(self.along(points_mm)) < self.half_length_mm) & (np.abs(off) < self.search_mm))
+
+    def along(self, points_mm: FloatArray) -> FloatArray:
+        """(n,) height along the axis of the points (n, 3) of the mantle that are nearest to these."""
         cos, sin = np.cos(self.half_angle_rad), np.sin(self.half_angle_rad)
-        out, z = np.hypot(points_mm[:, 0], points_mm[:, 1]) - self.radius_mm, points_mm[:, 2]
-        return np.asarray((np.abs(z * cos + out * sin) * cos < self.half_length_mm) & (np.abs(out * cos - z * sin) < self.search_mm))
+        out = np.hypot(points_mm[:, 0], points_mm[:, 1]) - self.radius_mm
+        return np.asarray((points_mm[:, 2] * cos + out * sin) * cos)
 
 
 def cylinder(local_from_part: FloatArray, radius_mm: float, half_length_mm: float, search_mm: float, outward: float) -> ConeShape:

@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from drivers.kinematics.se3 import FloatArray
-from measure.inspecting.fitting import Response
+from measure.inspecting.fitting import Fit, Response
 from measure.inspecting.patches import IntArray
 
 CORRELATION_LENGTHS_MM = (5.0, 20.0, 80.0, 320.0, np.inf)
@@ -38,6 +38,10 @@ class FieldError(Protocol):
         """Candidates (P, P) of the covariance of all parameters together; the largest counts, result by result."""
         ...
 
+    def explains(self, responses: Sequence[Response], number: int, by_patch: FloatArray) -> FloatArray:
+        """(p, p) sum over G groups of the products of changes (G, p, K, 3) that answer to the patches of one of the responses."""
+        ...
+
     def point_sigma_mm(self) -> float:
         """Of one coordinate of a typical point."""
         ...
@@ -53,6 +57,10 @@ class UnknownField:
         """No contribution."""
         n_params = sum(response.by_patch.shape[1] for response in responses)
         return (np.zeros((n_params, n_params)),)
+
+    def explains(self, responses: Sequence[Response], number: int, by_patch: FloatArray) -> FloatArray:
+        """Nothing."""
+        return _nothing(by_patch)
 
     def point_sigma_mm(self) -> float:
         """Nothing."""
@@ -74,6 +82,10 @@ class StatedField:
         distance2 = np.maximum(squared[:, None] + squared[None, :] - 2 * centres @ centres.T, 0.0)
         stacked = stack(responses)
         return tuple(self._covariance(stacked, distance2, length) for length in CORRELATION_LENGTHS_MM)
+
+    def explains(self, responses: Sequence[Response], number: int, by_patch: FloatArray) -> FloatArray:
+        """Nothing: a field whose reach nobody knows may as well be alike all over a feature."""
+        return _nothing(by_patch)
 
     def point_sigma_mm(self) -> float:
         """As stated."""
@@ -100,10 +112,26 @@ class SeenField:
         moved = np.einsum("pki,kim->pm", stack(responses), self.motion, optimize=True)
         return (np.asarray(moved @ self.covariance @ moved.T),)
 
+    def explains(self, responses: Sequence[Response], number: int, by_patch: FloatArray) -> FloatArray:
+        """As the unknowns move the groups."""
+        start = sum(len(response.centre_in_part_mm) for response in responses[:number])
+        motion = self.motion[start : start + by_patch.shape[2]]
+        changes = np.tensordot(by_patch, motion, axes=((2, 3), (0, 1)))
+        return np.asarray(np.einsum("gpm,gqm->pq", changes @ self.covariance, changes))
+
     def point_sigma_mm(self) -> float:
         """Rms over coordinates and patches."""
         rows = self.motion.reshape(-1, self.motion.shape[2])
         return float(np.sqrt(np.mean(np.einsum("km,km->k", rows @ self.covariance, rows))))
+
+
+def _nothing(by_patch: FloatArray) -> FloatArray:
+    return np.zeros((by_patch.shape[1], by_patch.shape[1]))
+
+
+def residual_covariances(fits: Sequence[Fit], responses: Sequence[Response], field: FieldError) -> list[FloatArray]:
+    """(p, p) of each fit by what its residuals show and the field does not explain; responses are the fits' own, in their order."""
+    return [fit.covariance([field.explains(responses, number, scatter.by_patch) for scatter in fit.scatters]) for number, fit in enumerate(fits)]
 
 
 def stack(responses: Sequence[Response]) -> FloatArray:

@@ -81,9 +81,23 @@ def test_features_of_a_machined_part_lie_in_their_intervals(tmp_path: Path) -> N
         runs.append(found)
         inside = np.mean([abs(error) <= 1 for error in found.values()])
         print(f"seed {seed}: {len(found)} figures, {inside:.0%} inside, worst {max(found, key=lambda name: abs(found[name]))}")
-    errors = np.array([error for run in runs for error in run.values()])
-    print(f"{len(errors)} figures of {len(runs)} parts: {np.mean(np.abs(errors) <= 1):.1%} in their intervals")
-    assert np.mean(np.abs(errors) <= 1) >= 0.90
+    names = dict.fromkeys(name for run in runs for name in run)
+    by_name = {name: np.array([run[name] for run in runs if name in run]) for name in names}
+    for name, errors in by_name.items():
+        print(f"{name:30s} {len(errors):3d} runs, {np.mean(np.abs(errors) <= 1):4.0%} inside, rms of error over U {_rms(errors):.2f}")
+    errors = np.concatenate(list(by_name.values()))
+    print(
+        f"{len(errors)} figures of {len(runs)} parts: {np.mean(np.abs(errors) <= 1):.1%} in their intervals, rms of error over U {_rms(errors):.2f}"
+    )
+    assert inside >= 0.93
+    # intervals that are all too wide hold everything
+    assert 0.4 <= _rms(errors) <= 0.6
+    # 90 of 100, less what 100 runs scatter
+    assert min(np.mean(np.abs(one) <= 1) for one in by_name.values()) >= 0.84
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 @pytest.mark.qualify

@@ -21,7 +21,7 @@ from measure.inspecting.fitting import Fit, Response
 from measure.inspecting.geometry import element_of
 from measure.inspecting.quantities import Model, own_quantities
 from measure.inspecting.spec import SphereFeature
-from measure.inspecting.uncertainty import joint_covariance
+from measure.inspecting.uncertainty import joint_covariance, residual_covariances
 from measure.inspecting.views import View, seen_field
 from tests.support.machined import supported, voxel_means
 from tests.support.volume import VolumeCell
@@ -105,7 +105,7 @@ def _values(feature: SphereFeature, fit: Fit, calibration: Calibration, views: S
     """Expanded uncertainties by name, and the field's standard deviation."""
     responses: list[Response] = [fit.response]
     field = seen_field(calibration, views, responses, np.eye(4))
-    covariance = joint_covariance(responses, [fit.covariance], field, 0.0)
+    covariance = joint_covariance(responses, residual_covariances([fit], responses, field), field, 0.0)
     model = Model({"S": feature}, {"S": fit})
     quantities = own_quantities("S", model.nominal(["S"])["S"])
     found = {quantity.name: 2 * model.measure(quantity, covariance).standard_uncertainty for quantity in quantities}

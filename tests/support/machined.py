@@ -27,7 +27,7 @@ from measure.inspecting.cloud import MeasuredCloud
 from measure.inspecting.geometry import Element
 from measure.inspecting.nominal import Nominal
 from measure.inspecting.spec import InspectionSpec
-from measure.inspecting.views import View
+from measure.inspecting.views import View, thinned
 
 PLACE_IN_BASE_MM = (880.0, 20.0, 180.0)
 PLANES = {
@@ -88,7 +88,7 @@ class MeasuredPart:
     def views(self) -> list[View]:
         """Thinned as `views_of` does it."""
         pairs = zip(self.scans, self.joints_rad, strict=True)
-        return [View(points[:: max(1, len(points) // 12_000)], joints, None) for points, joints in pairs]
+        return [View(thinned(points), joints, None) for points, joints in pairs]
 
     def cloud(self, calibration: Calibration, voxel_mm: float = 0.5) -> MeasuredCloud:
         """The stitched cloud, by a slow reference of the voxel fusion."""

@@ -87,7 +87,7 @@ def test_one_side_of_a_boss_with_strays_round_its_back_lies_in_its_interval() ->
         strays = arc_points(200.0, 14, rng, 15.0 - 0.15) * [-1, 1, 1]
         points = np.concatenate([wall, strays])
         fit = fit_shape(BOSS, FitPoints(points, np.ones(len(points)), np.arange(len(points))), name="boss")
-        covariance = joint_covariance([fit.response], [fit.covariance], StatedField(0.03, ""), 0.0)
+        covariance = joint_covariance([fit.response], [fit.covariance()], StatedField(0.03, ""), 0.0)
         rows = np.eye(5)[[0, 4]]
         u = np.array([np.sqrt(covariance.of(row[None])[0, 0]) for row in rows])
         normed.append(fit.params[[0, 4]] / (2 * u))
@@ -167,7 +167,7 @@ def test_a_rim_that_stands_in_the_wall_all_round_is_charged_to_the_diameter() ->
     worn[:, :2] *= np.where(clean[:, 2] > 2.0, 1 + 0.3 * (clean[:, 2] - 2.0) / 4.0 / 15, 1.0)[:, None]
     circle = StadiumShape(HOME, 15.0, 0.0, 6.0, 2.0)
     fits = [fit_shape(circle, FitPoints(points, np.ones(900), np.arange(900)), name="bore") for points in (clean, worn)]
-    widths = [4 * float(np.sqrt(fit.covariance[2, 2])) for fit in fits]
+    widths = [4 * float(np.sqrt(fit.covariance()[2, 2])) for fit in fits]
     errors = [2 * abs(float(fit.params[2])) for fit in fits]
     assert errors[0] <= widths[0] <= 0.03
     assert 0.05 <= errors[1] <= widths[1]

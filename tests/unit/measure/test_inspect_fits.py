@@ -11,8 +11,7 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.edges import rim_points
-from measure.inspecting.fitting import Fit, FitPoints, fit_shape
-from measure.inspecting.patches import patches_of
+from measure.inspecting.fitting import Fit, FitPoints, fit_shape, response_patches
 from measure.inspecting.shapes import ConeShape, PlaneShape, Shape, SphereShape, StadiumShape, cylinder, frame_about
 from measure.inspecting.uncertainty import StatedField, joint_covariance
 from tests.support.machined import voxel_means
@@ -86,10 +85,10 @@ def test_the_stated_response_is_what_a_refit_shows(name: str) -> None:
     """Patches moved by small random displacements: the fit follows as its response says."""
     rng = np.random.default_rng(3)
     local = on_surface(name, 1500, rng) + rng.normal(0, 1e-4, (1500, 3))
-    before = fitted(name, local)
+    before = fitted(name, local, voxel_mm=1.0)
     displacement = rng.normal(0, 0.02, before.response.centre_in_part_mm.shape)
     in_part = se3.apply(se3.inverse(FRAME), local)
-    moved = se3.apply(FRAME, in_part + displacement[patches_of(in_part)[0]])
+    moved = se3.apply(FRAME, in_part + displacement[response_patches(SHAPES[name], in_part)[0]])
     expected = np.einsum("kpi,ki->p", before.response.by_patch, displacement)
     found = fitted(name, moved, voxel_mm=1.0).params - before.params
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
@@ -129,7 +128,7 @@ def test_intervals_from_residuals_cover_noise_and_bumps_that_neighbours_share(na
         rng = np.random.default_rng([7, seed])
         off = rng.normal(0, 0.03, len(base)) + bumps(rng) * 0.03
         found = fitted(name, base + off[:, None] * normals)
-        inside.append(np.abs(found.params - TRUE[name]) <= 2 * np.sqrt(np.diag(found.covariance)))
+        inside.append(np.abs(found.params - TRUE[name]) <= 2 * np.sqrt(np.diag(found.covariance())))
     assert 0.88 <= np.mean(inside) <= 0.995
 
 
@@ -147,7 +146,7 @@ def test_a_stated_field_covers_whatever_its_correlation_length() -> None:
     """Displacements of the stated size, common to patches of any size: no parameter is worse than stated."""
     local = on_surface("cylinder", 500, np.random.default_rng(8))
     exact = fitted("cylinder", local)
-    covariance = joint_covariance([exact.response], [exact.covariance], StatedField(0.05, "stated"), 0.0)
+    covariance = joint_covariance([exact.response], [exact.covariance()], StatedField(0.05, "stated"), 0.0)
     sigma = np.array([np.sqrt(covariance.of(row[None])[0, 0]) for row in np.eye(5)])
     for length_mm in (3.0, 15.0):
         draw = _bumps(local, length_mm)
@@ -165,7 +164,7 @@ def test_what_two_planes_share_cancels_in_their_distance() -> None:
         fit_shape(shape, FitPoints(np.column_stack([grid, np.full(len(grid), z)]), np.ones(len(grid)), np.arange(len(grid))), name="p")
         for shape, z in zip(shapes, (0.0, 20.0), strict=True)
     ]
-    joint = joint_covariance([fit.response for fit in fits], [fit.covariance for fit in fits], StatedField(0.1, ""), 0.0)
+    joint = joint_covariance([fit.response for fit in fits], [fit.covariance() for fit in fits], StatedField(0.1, ""), 0.0)
     long_range = joint.by_field[-1]
     gradient = np.array([[-1.0, 0, 0, 1.0, 0, 0]])
     assert (gradient @ long_range @ gradient.T)[0, 0] < 1e-9
@@ -194,7 +193,7 @@ def test_a_hole_in_a_sheet_is_measured_by_its_rim_within_what_its_spacing_allows
         sheet = sheet[np.hypot(sheet[:, 0] - 0.2, sheet[:, 1] + 0.1) > 8.1]
         rim, rows, spacing = rim_points(shape, sheet, np.flatnonzero(shape.near(sheet)), "rim")
         assert spacing == pytest.approx(0.5, rel=0.15)
-        found = fit_shape(shape, FitPoints(rim, np.ones(len(rim)), rows), name="rim")
+        found = fit_shape(shape, FitPoints(rim, np.ones(len(rim)), rows, spacing), name="rim")
         errors.append(found.params - [0.2, -0.1, 0.1])
     assert np.abs(errors).max() < 0.5 / np.sqrt(3) * 2
     assert abs(np.mean(errors, axis=0)[2]) < 0.12

@@ -48,3 +48,26 @@ def test_views_that_all_see_a_wall_share_its_error_and_one_too_small_for_them_ha
     beside = wall - np.array([1.0, 0, 0])  # none of the thinned points is on the wall itself
     (nearby,) = seen_field(PERFECT, [view(beside, place)], [fit.response], np.eye(4)).covariances([fit.response])
     assert np.sqrt(nearby[0, 0]) == pytest.approx(whole, rel=0.05)
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_views_that_differ_more_than_the_calibration_s_pose_noise_are_taken_at_their_word(times: float) -> None:
+    """A plate seen whole by 12 views, each off by the stated pose noise, or by three times as much."""
+    rng = np.random.default_rng(int(10 * times))
+    found = []
+    for _ in range(8):
+        grid = np.column_stack([rng.uniform(-60, 60, (3000, 2)), np.zeros(3000)])
+        views, seen = [], []
+        for number in range(12):
+            stated = se3.from_rotation_translation(se3.exp_so3([np.pi, 0, 0.5 * number]), [rng.uniform(-30, 30), 0.0, 350.0])
+            twist = times * np.concatenate([rng.normal(0, PERFECT.noise.pose_mm, 3), rng.normal(0, PERFECT.noise.pose_rad, 3)])
+            about = se3.from_rotation_translation(np.eye(3), stated[:3, 3])
+            true = about @ se3.exp(twist) @ se3.inverse(about) @ stated
+            views.append(View(se3.apply(se3.inverse(true), grid), None, stated))
+            seen.append(se3.apply(stated, views[-1].points_in_camera_mm))
+        points = np.concatenate(seen)
+        fit = fit_shape(PlaneShape(np.eye(4), (55.0, 55.0), 2.0), FitPoints(points, np.ones(len(points)), np.arange(len(points)), 0.5), name="plate")
+        field = seen_field(PERFECT, views, [fit.response], np.eye(4))
+        found.append(np.sqrt(field.covariance[-1, -1]) / PERFECT.noise.pose_rad)
+    assert np.mean(found) == pytest.approx(times, rel=0.25)
+    assert min(found) >= 1.0

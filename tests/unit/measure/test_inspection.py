@@ -268,12 +268,12 @@ def test_intervals_through_the_views_of_a_drawn_calibration_cover() -> None:
     eyes = [se3.from_rotation_translation(se3.exp_so3([np.pi + a, b, 0.5 * a]), [0, 0, 0]) for a in (-0.4, 0.0, 0.4) for b in (-0.3, 0.3)]
     middle = PLACE[:3, 3] + [0, 0, 40]
     poses = [se3.from_rotation_translation(eye[:3, :3], middle - eye[:3, :3] @ [0, 0, 400.0]) for eye in eyes]
-    reference = values_of(inspected(CLOUD[::3], checks=CHECKS))
+    reference = values_of(inspected(CLOUD[::2], checks=CHECKS))
     normed: list[float] = []
     for seed in range(10):
         rng = np.random.default_rng([20, seed])
         system = DrawnSystem(rng.normal(0, sigma), sigma)
-        shares = np.array_split(rng.permutation(CLOUD[::3]), len(poses))
+        shares = np.array_split(rng.permutation(CLOUD[::2]), len(poses))
         views, clouds = [], []
         for pose, share in zip(poses, shares, strict=True):
             twist = np.concatenate([rng.normal(0, 0.02, 3), rng.normal(0, 1e-4, 3)])
