@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from calibrate import Calibration
     from measure.console import Console
     from measure.history.displacement import DisplacementField
-    from measure.history.rows import ActivationRow
+    from measure.history.rows import ActivationRow, ResultRow
     from measure.history.store import History
 
 HistoryPlace = Annotated[
@@ -58,13 +58,20 @@ def history(
             run.finish({**_told_history(run.console, opened, name, rule), "csv": table, "chart": chart})
 
 
+def _result_json(row: ResultRow) -> dict[str, object]:
+    told: dict[str, object] = {"kind": row.kind, "calibration": row.calibration, "taken_utc": row.taken_utc, "verdict": row.verdict, "changed": row.changed}
+    return told | ({"remark": row.remark} if row.remark else {})
+
+
 def _told_history(console: Console, opened: History, name: str, rule: float | None) -> dict[str, object]:
     calibrations, results, activations = opened.calibrations(name), opened.results(name), opened.activations(name)
     active = activations[-1].calibration if activations else None
     rows = [[c.created_utc[:16], c.id[:_SHOWN], c.verdict, "in use" if c.id == active else "", (c.parent or "")[:_SHOWN]] for c in calibrations]
     console.table(f"cell {name}: calibrations", ["made", "id", "verdict", "", "of"], rows)
     console.table(
-        "results", ["taken", "what", "calibration", "verdict"], [[r.taken_utc[:16], r.kind, r.calibration[:_SHOWN], r.verdict] for r in results]
+        "results",
+        ["taken", "what", "calibration", "verdict", "changed, remark"],
+        [[r.taken_utc[:16], r.kind, r.calibration[:_SHOWN], r.verdict, r.changed or r.remark] for r in results],
     )
     rows = [[a.at_utc[:16], a.calibration[:_SHOWN], a.who, "forced: " + a.why if a.forced else a.why] for a in activations]
     console.table("put to use", ["at", "calibration", "who", "why"], rows)
@@ -78,7 +85,7 @@ def _told_history(console: Console, opened: History, name: str, rule: float | No
             {"id": c.id, "created_utc": c.created_utc, "recorded_utc": c.recorded_utc, "verdict": c.verdict, "parent": c.parent, "file": c.file}
             for c in calibrations
         ],
-        "results": [{"kind": r.kind, "calibration": r.calibration, "taken_utc": r.taken_utc, "verdict": r.verdict} for r in results],
+        "results": [_result_json(r) for r in results],
         "activations": [_activation_json(a) for a in activations],
     }
 

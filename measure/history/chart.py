@@ -40,12 +40,11 @@ def points_of(checks: Sequence[ResultRow]) -> list[ChartPoint]:
 def _point(row: ResultRow) -> ChartPoint:
     data = row.data
     chi, freedom = _number(data.get("chi_square")), _number(data.get("freedom"))
-    named = data.get("named")
     return ChartPoint(
         taken_utc=row.taken_utc,
         calibration=row.calibration,
         verdict=row.verdict,
-        named=" or ".join(map(str, named)) if isinstance(named, list) else "",
+        named=row.changed,
         p_value=_number(data.get("p_value")),
         chi_square_ratio=None if chi is None or not freedom else chi / freedom,
         rms_mm=_number(data.get("rms_mm")),

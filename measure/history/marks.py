@@ -74,6 +74,4 @@ def _overdue(history: History, calibration: Calibration, before: list[ResultRow]
 
 
 def _what(row: ResultRow) -> str:
-    named = row.data.get("named")
-    causes = " or ".join(str(name) for name in named) if isinstance(named, list) and named else "something changed"
-    return f"{row.taken_utc[:16]}Z, {causes}"
+    return f"{row.taken_utc[:16]}Z, {row.changed or 'something changed'}"

@@ -46,6 +46,29 @@ class ResultRow:
         found = json.loads(self.content)
         return found if isinstance(found, dict) else {}
 
+    @property
+    def changed(self) -> str:
+        """What a check named as changed, in words; nothing where it named nothing, or is no check."""
+        data = self.data
+        since = data.get("since")
+        told = _causes(data)
+        if told or not isinstance(since, Mapping) or not _causes(since):
+            return told
+        return f"{_causes(since)} since {since.get('earlier')}"
+
+    @property
+    def remark(self) -> str:
+        """What nobody may read of it without: that training data were used."""
+        return str(self.data.get("remark", ""))
+
+
+def _causes(data: Mapping[str, object]) -> str:
+    together, named = data.get("together"), data.get("named")
+    pairs = together.get("pairs") if isinstance(together, Mapping) else None
+    if isinstance(pairs, list):
+        return " or ".join(" and ".join(map(str, pair["causes"])) for pair in pairs)
+    return " or ".join(map(str, named)) if isinstance(named, list) else ""
+
 
 @dataclass(frozen=True, slots=True)
 class ActivationRow:

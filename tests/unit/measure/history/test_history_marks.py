@@ -105,6 +105,21 @@ def test_a_history_that_cannot_be_written_spoils_no_result(tmp_path: Path) -> No
         History.open(str(tmp_path / "no" / "h.sqlite"))
 
 
+def test_two_causes_changes_since_and_training_data_are_told_in_the_rows(history: History) -> None:
+    pairs = [{"causes": ["axis 3", "sphere moved"], "probability": 0.8}]
+    contents: list[dict[str, object]] = [
+        {"named": ["axis 3"], "together": {"log_odds": 9.0, "pairs": pairs}},
+        {"named": [], "together": None, "since": {"earlier": "check_0001", "named": ["axis 5"], "together": None}},
+        {"named": [], "remark": "TRAINING DATA USED"},
+    ]
+    for day, content in enumerate(contents):
+        history.add_result("check", named(1), content, verdict="reject", taken_utc=DAYS[day], software="tests")
+    rows = history.results(CELL, "check")
+    assert [row.changed for row in rows] == ["axis 3 and sphere moved", "axis 5 since check_0001", ""]
+    assert [row.remark for row in rows] == ["", "", "TRAINING DATA USED"]
+    assert [point.named for point in points_of(rows)] == [row.changed for row in rows]
+
+
 def test_the_chart_tells_every_check(history: History) -> None:
     checked(history, 2, "conform")
     checked(history, 5, "reject", "axis 3")
