@@ -59,7 +59,13 @@ def history(
 
 
 def _result_json(row: ResultRow) -> dict[str, object]:
-    told: dict[str, object] = {"kind": row.kind, "calibration": row.calibration, "taken_utc": row.taken_utc, "verdict": row.verdict, "changed": row.changed}
+    told: dict[str, object] = {
+        "kind": row.kind,
+        "calibration": row.calibration,
+        "taken_utc": row.taken_utc,
+        "verdict": row.verdict,
+        "changed": row.changed,
+    }
     return told | ({"remark": row.remark} if row.remark else {})
 
 

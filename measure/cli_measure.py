@@ -108,7 +108,13 @@ def comparison_rows(result: VerifyResult) -> list[list[object]]:
         ["distance of all points from the sphere (rms)", before and before.radial_rms_mm, after.radial_rms_mm],
     ]
     if lengths_after:
-        rows.append([f"error of {len(lengths_after)} lengths between spheres (rms)", _rms(lengths_before), _rms(lengths_after)])
+        rows.append(
+            [
+                f"error of {len(lengths_after)} lengths {'between targets' if result.of_points_alone else 'between spheres'} (rms)",
+                _rms(lengths_before),
+                _rms(lengths_after),
+            ]
+        )
         rows.append(["worst length", _worst(lengths_before), _worst(lengths_after)])
     if after.spheres:
         diameters_before = [sphere.diameter_error_mm for sphere in before.spheres.values()] if before else []

@@ -149,7 +149,7 @@ def result_lead(verification: VerifyResult | None) -> str:
     unseen = " that the calibration never saw" if verification.held_out else ""
     if verification.of_points_alone:
         points = f"{verification.used} of {verification.n_shots} external reference points{unseen}"
-        return f"Figures on {points}: the robot alone, no sphere was seen."
+        return f"Figures on {points}: the robot alone, no sphere was seen. Uncalibrated: nominal robot, the target where the calibration found it."
     places = len(verification.figures.spheres)
     seen = f"{verification.used} of {verification.n_shots} shots{unseen}, of {places} sphere{'' if places == 1 else 's'}"
     if verification.before is None:

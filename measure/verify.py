@@ -33,7 +33,7 @@ from measure.length_uncertainty import diameter_standard_uncertainty_mm
 from measure.placing import JudgedSystem, check_fits, nominal_base_from_camera, pose_of
 from measure.proof.conditions import conditions_of
 from measure.proof.external import external_figures, judgeable, known_external
-from measure.proof.external_lengths import external_gaps, external_lengths
+from measure.proof.external_lengths import external_gaps, external_lengths, nominal_length_errors_mm
 from measure.proof.judging import gaps_of, judgements, sphere_uncertainties
 from measure.proof.lengths import length_results
 from measure.proof.poses import repeated_poses, training_shots
@@ -86,11 +86,14 @@ def verify(
         folders={session.digest: session.folder for session in sessions},
     )
     before = _figures_before(observations, sessions, cells, artefact.spheres, line_profile=cells[0].camera.kind == "line_profile")
+    lengths_before = {} if before is None else _length_errors(before, artefact.lengths)
+    if found.of_points_alone:
+        lengths_before = nominal_length_errors_mm(calibration, observations.external)
     return replace(
         found,
         sessions=tuple(SessionName(session.folder.name, session.digest) for session in sessions),
         before=before,
-        before_length_errors_mm={} if before is None else _length_errors(before, artefact.lengths),
+        before_length_errors_mm=lengths_before,
         reasons=(*found.reasons, *dict.fromkeys(marks), *artefact.notes, *temperature_changes(calibration.temperatures_c, sessions)),
         conditions=conditions_of(sessions, artefact.spheres, artefact.lengths),
         seconds=time.perf_counter() - began,

@@ -121,7 +121,7 @@ class VerifyResult:
             "warnings": list(self.warnings),
             "verdict": self.verdict,
             "reasons": list(self.reasons),
-            "before": None if self.before is None else _before_json(self.before, self.before_length_errors_mm),
+            "before": _before_json(self.before, self.before_length_errors_mm),
             "limits": None if self.limits is None else self.limits.model_dump(mode="json"),
             "judgements": [_judgement_json(j) for j in self.judgements],
             "decision_rule": self.decision_rule,
@@ -178,7 +178,9 @@ def _figures_json(session: str, view: ViewFigures) -> dict[str, object]:
     }
 
 
-def _before_json(figures: Figures, length_errors_mm: dict[str, float]) -> dict[str, object]:
+def _before_json(figures: Figures | None, length_errors_mm: dict[str, float]) -> dict[str, object] | None:
+    if figures is None:
+        return {"length_errors_mm": length_errors_mm} if length_errors_mm else None
     return {
         "centre_rms_mm": figures.centre_rms_mm,
         "centre_max_mm": figures.centre_max_mm,

@@ -16,6 +16,8 @@ from calibrate.external import external_sigma_mm
 from calibrate.external_points import ExternalShot
 from calibrate.external_result import ExternalResult
 from calibrate.result import Calibration
+from drivers.kinematics import mdh, se3
+from drivers.kinematics.se3 import FloatArray
 from measure.placing import MeasuringSystem
 from measure.proof.external import PlacedTarget, known_external, noise_mm2, placed_target
 from measure.proof.lengths import LengthResult
@@ -31,17 +33,40 @@ def external_lengths(calibration: MeasuringSystem, shots: Sequence[ExternalShot]
     known = known_external(calibration)
     if known is None or not isinstance(calibration, Calibration):
         return ()
-    usable = sorted((shot for shot in shots if shot.target in known.targets), key=lambda shot: shot.key)
-    names = _names(usable)
-    found = []
-    groups = dict.fromkeys((shot.session, shot.reference) for shot in usable)
-    for group in groups:
-        members = [i for i, shot in enumerate(usable) if (shot.session, shot.reference) == group]
-        placed = {i: placed_target(calibration, usable[i]) for i in members}
-        found += [
-            _length(calibration, known, (usable[i], usable[j]), (placed[i], placed[j]), (names[i], names[j])) for i, j in _pairs(usable, members)
-        ]
+    found = [
+        _length(calibration, known, (first, second), (placed_target(calibration, first), placed_target(calibration, second)), names)
+        for names, first, second in _ends(known, shots)
+    ]
     return tuple(sorted(found, key=lambda length: (-length.reference_mm, length.label)))
+
+
+def nominal_length_errors_mm(calibration: MeasuringSystem, shots: Sequence[ExternalShot]) -> dict[str, float]:
+    """The same lengths by the nominal robot, with the target where the calibration has it on the flange: error by label."""
+    known, model = known_external(calibration), calibration.model
+    if known is None or model is None:
+        return {}
+
+    def seen_mm(shot: ExternalShot) -> FloatArray:
+        return se3.apply(mdh.base_from_flange(model, shot.joints_rad), known.targets[shot.target].point_in_flange_mm)
+
+    return {
+        "-".join(names): float(np.linalg.norm(seen_mm(second) - seen_mm(first)) - _reference_mm(first, second))
+        for names, first, second in _ends(known, shots)
+    }
+
+
+def _ends(known: ExternalResult, shots: Sequence[ExternalShot]) -> list[tuple[tuple[str, str], ExternalShot, ExternalShot]]:
+    """Names and points of every length; a tracker stands still within a session."""
+    usable = sorted((shot for shot in shots if shot.target in known.targets), key=lambda shot: shot.key)
+    names, found = _names(usable), []
+    for group in dict.fromkeys((shot.session, shot.reference) for shot in usable):
+        members = [i for i, shot in enumerate(usable) if (shot.session, shot.reference) == group]
+        found += [((names[i], names[j]), usable[i], usable[j]) for i, j in _pairs(usable, members)]
+    return found
+
+
+def _reference_mm(first: ExternalShot, second: ExternalShot) -> float:
+    return float(np.linalg.norm(second.point_in_reference_mm - first.point_in_reference_mm))
 
 
 def external_gaps(calibration: MeasuringSystem, shots: Sequence[ExternalShot]) -> list[str]:
@@ -89,7 +114,7 @@ def _length(
     return LengthResult(
         between=names,
         measured_mm=float(np.linalg.norm(way)),
-        reference_mm=float(np.linalg.norm(shots[1].point_in_reference_mm - shots[0].point_in_reference_mm)),
+        reference_mm=_reference_mm(*shots),
         reference_standard_uncertainty_mm=float(np.sqrt(reference)),
         repeat_standard_uncertainty_mm=float(np.sqrt(max(test - reference, 0.0))),
         calibration_standard_uncertainty_mm=float(np.sqrt(max(predicted, 0.0))),

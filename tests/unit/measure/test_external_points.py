@@ -90,6 +90,10 @@ def test_a_robot_alone_is_verified_on_unseen_points(sessions: Path, tmp_path: Pa
     assert isinstance(lengths, list)
     assert len(lengths) == 12
     assert all(abs(x["error_mm"]) < 2 * x["expanded_uncertainty_mm"] for x in lengths)
+    before = data["before"]
+    assert isinstance(before, dict)
+    assert before["length_errors_mm"].keys() == {"-".join(x["between"]) for x in lengths}
+    assert max(map(abs, before["length_errors_mm"].values())) > 3 * max(abs(x["error_mm"]) for x in lengths)
     assert told(capfd, "report", tmp_path / "c.yaml", unseen, "-o", tmp_path / "report.html", "--pdf", tmp_path / "report.pdf")[0] == 0
     assert "24 of 24 external reference points that the calibration never saw" in (tmp_path / "report.html").read_text()
     # the same stops measured again are the calibration's own poses, whatever the reading
