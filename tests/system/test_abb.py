@@ -158,6 +158,29 @@ def test_the_whole_way_over_tcp_and_over_the_serial_line_gives_what_the_plain_si
     assert result.told["n_shots"] == N_VERIFICATION
 
 
+@pytest.mark.qualify
+def test_the_whole_way_over_each_line_alone(work: Work, cli: Cli) -> None:
+    """Calibration and verification over TCP, and again over the serial line; each run begins with a robot that never moved, as the plain one does."""
+    plain = work.folder / "plain.yaml"
+    told = {}
+    for line in ("alone", "alone_tcp", "alone_serial"):
+        for name in ("calibration", "verification"):
+            with served("--cell", plain, "--speed-up", 60) as at:
+                how: dict[str, object] = {"serial_port": at.serial_port} if line == "alone_serial" else {"host": "127.0.0.1", "port": at.port}
+                cell = plain if line == "alone" else work.cell(line, at, **how)
+                run("capture", cell, plan_for(work, cell, name), "-o", work.folder / f"{line}_{name}", "--yes", "-q")
+            if line != "alone":
+                _same_sessions(work.folder / f"{line}_{name}", work.folder / f"alone_{name}", same_scans=True)
+        calibration = work.folder / f"{line}.calibration.yaml"
+        session = str(work.folder / f"{line}_calibration")
+        assert run_app(app, ["calibrate", session, "-o", str(calibration), "--camera-error", "pillow", "-q"]) in {0, 3}
+        told[line] = cli("verify", calibration, work.folder / f"{line}_verification", "--json").told
+    for line in ("alone_tcp", "alone_serial"):
+        assert abs(told[line]["centre_rms_mm"] - told["alone"]["centre_rms_mm"]) < ONE_UM
+        errors = ([length["error_mm"] for length in found["lengths"]] for found in (told[line], told["alone"]))
+        np.testing.assert_allclose(*errors, atol=ONE_UM)
+
+
 def _same_sessions(found: Path, expected: Path, *, same_scans: bool) -> None:
     """Axis angles within what the line rounds, and the very same scans where the same motions went before."""
     shots, others = read_session(found).shots, read_session(expected).shots
