@@ -136,8 +136,8 @@ def verify_observations(
     of_diameters = {n: diameter_standard_uncertainty_mm(calibration, s.centre_in_base_mm, by_sphere[n]) for n, s in figures.spheres.items()}
     judged = () if limits is None else judgements(limits, figures, lengths, cell.spheres)
     external = external_figures(calibration, observations.external)
-    of_points = () if views else external_gaps(calibration, observations.external)
-    verdict, reasons = overall(judged, [*gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery), *of_points])
+    more = [*(() if volume is None else volume.gaps()), *(() if views else external_gaps(calibration, observations.external))]
+    verdict, reasons = overall(judged, [*gaps_of(limits, figures, lengths, line_profile=line_profile, flattery=flattery), *more])
     return VerifyResult(
         calibration_id=calibration.id,
         sessions=(),

@@ -18,6 +18,8 @@ from measure.proof.lengths import LengthResult
 
 N_LINES, LENGTHS_PER_LINE = 7, 5
 LONGEST_SHARE = 2.0 / 3.0
+LEAST_SHARE = 0.25
+"""Of the diagonal: lengths that are all shorter, as a slide of 50 mm is, prove nothing about the volume."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +47,19 @@ class VolumeFigures:
         """For `--json`."""
         return {name: getattr(self, name) for name in self.__slots__} | {"longest_share": self.longest_share}
 
+    def gaps(self) -> tuple[str, ...]:
+        """What keeps these lengths from proving anything, in sentences."""
+        if self.longest_share is None or self.longest_share >= LEAST_SHARE:
+            return ()
+        return (
+            f"the longest judged length is {self.longest_mm:.0f} mm, {100 * self.longest_share:.0f} % of the work volume's diagonal: so short ones "
+            f"see neither scale nor a bent base, {100 * LEAST_SHARE:.0f} % are the least and {100 * LONGEST_SHARE:.0f} % are wanted",
+        )
+
     def warnings(self) -> tuple[str, ...]:
         """What the lengths leave untested, in sentences."""
         found = []
-        if self.longest_share is not None and self.longest_share < LONGEST_SHARE:
+        if self.longest_share is not None and LEAST_SHARE <= self.longest_share < LONGEST_SHARE:
             found.append(
                 f"the longest judged length is {self.longest_mm:.0f} mm, {100 * self.longest_share:.0f} % of the work volume's diagonal: "
                 f"a scale or a bent base shows on lengths of {100 * LONGEST_SHARE:.0f} % and more"

@@ -17,7 +17,7 @@ from drivers.kinematics.se3 import FloatArray
 from measure.proof.probing import probing_of
 from measure.proof.scatter import OwnCentre, agreed_variance, scatter_scale, student_factor
 from measure.proof.tables import proof_tables
-from measure.proof.volume import volume_lines
+from measure.proof.volume import VolumeFigures, volume_lines
 from measure.sphere_figures import SphereFigures, SphereSize, figures_of
 from measure.verify import verify
 from measure.verify_result import TRAINING_REMARK
@@ -103,6 +103,14 @@ def test_a_slide_is_paired_view_by_view_with_another_pose(tmp_path: Path) -> Non
     assert table.rows[0][2] == f"{np.abs(expected).mean():.4f}"
     assert "0.1232" in table.rows[1][2]
     assert "may differ" in table.lead
+
+
+def test_short_lengths_alone_prove_nothing_of_a_volume() -> None:
+    short, fair, long = (VolumeFigures(2, 0.01, 0.01, longest, 1000.0, 2, 2) for longest in (50.0, 400.0, 700.0))
+    assert [len(v.gaps()) for v in (short, fair, long)] == [1, 0, 0]
+    assert [len(v.warnings()) for v in (short, fair, long)] == [0, 1, 0]
+    assert "50 mm, 5 % of the work volume's diagonal" in short.gaps()[0]
+    assert replace(short, diagonal_mm=None).gaps() == ()
 
 
 def test_a_slide_whose_ends_share_their_poses_is_refused(tmp_path: Path) -> None:
