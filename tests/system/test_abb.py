@@ -177,8 +177,8 @@ def test_the_whole_way_over_each_line_alone(work: Work, cli: Cli) -> None:
         told[line] = cli("verify", calibration, work.folder / f"{line}_verification", "--json").told
     for line in ("alone_tcp", "alone_serial"):
         assert abs(told[line]["centre_rms_mm"] - told["alone"]["centre_rms_mm"]) < ONE_UM
-        errors = ([length["error_mm"] for length in found["lengths"]] for found in (told[line], told["alone"]))
-        np.testing.assert_allclose(*errors, atol=ONE_UM)
+        found, expected = ([length["error_mm"] for length in told[name]["lengths"]] for name in (line, "alone"))
+        np.testing.assert_allclose(found, expected, atol=ONE_UM)
 
 
 def _same_sessions(found: Path, expected: Path, *, same_scans: bool) -> None:
