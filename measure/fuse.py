@@ -297,21 +297,20 @@ class VoxelGrid:
 
         found = [inside(rows) for rows in self._unsorted()]
         together = np.concatenate(found) if found else np.empty((0, self._words), dtype=np.int64)
-        together = together[np.argsort(together[:, kernels.KEY], kind="stable")]
+        together = together[np.argsort(together[:, kernels.KEY])]
         return (together[first : first + PIECE] for first in range(0, len(together), PIECE))
 
     def _sorted_parts(self) -> Iterator[IntArray]:
         from measure import fuse_kernels as kernels
 
         starts = np.concatenate([[0], np.cumsum([part.n_rows for part in self._parts])])
-        order = np.argsort(np.concatenate([part.rows[: part.n_rows, kernels.KEY] for part in self._parts]), kind="stable")
+        # no key stands twice in a table, so any way of sorting gives the same order
+        order = np.argsort(np.concatenate([part.rows[: part.n_rows, kernels.KEY] for part in self._parts]))
+        tables = tuple(part.rows for part in self._parts)
         for first in range(0, len(order), PIECE):
             chosen = order[first : first + PIECE]
             rows = np.empty((len(chosen), self._words), dtype=np.int64)
-            owner = np.searchsorted(starts, chosen, side="right") - 1
-            for number, part in enumerate(self._parts):
-                mine = owner == number
-                rows[mine] = part.rows[chosen[mine] - starts[number]]
+            kernels.gather(tables, starts, chosen, rows)
             yield rows
 
     def _settled_tiles(self) -> Tiles:

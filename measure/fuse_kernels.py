@@ -40,6 +40,7 @@ PARTS = 16
 BAND = 2048
 """Points that are looked at together: most bands hold points of few parts."""
 _BLOCK_BITS = 5
+_NEAR_BITS = 11
 
 FIRST_CAPACITY = 1 << 9
 _ROW_BITS = 24
@@ -129,18 +130,42 @@ def _new_row(index: NDArray[np.uint32], slot: np.int64, rows: IntArray, n_rows: 
 
 
 @compiled
-def _add_place(rows: IntArray, row: np.int64, w: np.int64, fractions: NDArray[np.int16], i: int) -> None:
+def _add_point(
+    rows: IntArray,
+    halves: NDArray[np.int32],
+    row: np.int64,
+    i: int,
+    fractions: NDArray[np.int16],
+    weights: NDArray[np.uint8],
+    normals: NDArray[np.int16],
+    variances: NDArray[np.uint32],
+    fates: IntArray,
+) -> None:
+    if halves[row, WEIGHT] >= WEIGHT_LIMIT:
+        fates[CROWDED] += 1
+        return
+    w = np.int64(weights[i])
     x, y, z = np.int64(fractions[i, 0]), np.int64(fractions[i, 1]), np.int64(fractions[i, 2])
-    rows[row, SUM] += w * x
-    rows[row, SUM + 1] += w * y
-    rows[row, SUM + 2] += w * z
-    if rows.shape[1] == FULL_WORDS:
-        rows[row, MOMENT] += w * x * x
-        rows[row, MOMENT + 1] += w * x * y
-        rows[row, MOMENT + 2] += w * x * z
-        rows[row, MOMENT + 3] += w * y * y
-        rows[row, MOMENT + 4] += w * y * z
-        rows[row, MOMENT + 5] += w * z * z
+    wx, wy, wz = w * x, w * y, w * z
+    halves[row, COUNT] += 1
+    halves[row, WEIGHT] += np.int32(w)
+    rows[row, SUM] += wx
+    rows[row, SUM + 1] += wy
+    rows[row, SUM + 2] += wz
+    if rows.shape[1] != FULL_WORDS:
+        return
+    rows[row, MOMENT] += wx * x
+    rows[row, MOMENT + 1] += wx * y
+    rows[row, MOMENT + 2] += wx * z
+    rows[row, MOMENT + 3] += wy * y
+    rows[row, MOMENT + 4] += wy * z
+    rows[row, MOMENT + 5] += wz * z
+    if normals.shape[0]:
+        rows[row, NORMAL] += w * np.int64(normals[i, 0])
+        rows[row, NORMAL + 1] += w * np.int64(normals[i, 1])
+        rows[row, NORMAL + 2] += w * np.int64(normals[i, 2])
+    if variances.shape[0]:
+        rows[row, VARIANCE] += w * np.int64(variances[i])
 
 
 @compiled
@@ -167,8 +192,9 @@ def insert(
     Returns the next point and the number of rows.
     """
     limit = min(rows.shape[0], index.shape[0] // 2)
-    full, with_normals, with_variances = rows.shape[1] == FULL_WORDS, normals.shape[0] > 0, variances.shape[0] > 0
     n = keys.shape[0]
+    # the voxels of the row of pixels before: most are met again, and need no search then
+    near_keys, near_rows = np.zeros(1 << _NEAR_BITS, dtype=np.int64), np.empty(1 << _NEAR_BITS, dtype=np.int32)
     last_key, row = np.int64(0), np.int64(0)
     i = start
     while i < n:
@@ -182,32 +208,41 @@ def insert(
                 continue
             key = keys[i]
             if key != last_key:
-                slot = _slot_of(index, rows, key)
-                if index[slot] == 0:
-                    if n_rows >= limit:
-                        return i, n_rows
-                    _new_row(index, slot, rows, n_rows, key)
-                    n_rows += 1
-                row, last_key = np.int64(index[slot] & np.uint32(_ROW_MASK)) - 1, key
+                near = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - _NEAR_BITS))
+                if near_keys[near] == key:
+                    row = np.int64(near_rows[near])
+                else:
+                    slot = _slot_of(index, rows, key)
+                    if index[slot] == 0:
+                        if n_rows >= limit:
+                            return i, n_rows
+                        _new_row(index, slot, rows, n_rows, key)
+                        n_rows += 1
+                    row = np.int64(index[slot] & np.uint32(_ROW_MASK)) - 1
+                    near_keys[near], near_rows[near] = key, row
+                last_key = key
                 if halves[row, LAST_SCAN] != scan:
                     halves[row, LAST_SCAN] = scan
                     halves[row, SCANS] += 1
-            w = np.int64(weights[i])
-            if halves[row, WEIGHT] >= WEIGHT_LIMIT:
-                fates[CROWDED] += 1
-                i += 1
-                continue
-            halves[row, COUNT] += 1
-            halves[row, WEIGHT] += np.int32(w)
-            _add_place(rows, row, w, fractions, i)
-            if full and with_normals:
-                rows[row, NORMAL] += w * np.int64(normals[i, 0])
-                rows[row, NORMAL + 1] += w * np.int64(normals[i, 1])
-                rows[row, NORMAL + 2] += w * np.int64(normals[i, 2])
-            if full and with_variances:
-                rows[row, VARIANCE] += w * np.int64(variances[i])
+            _add_point(rows, halves, row, i, fractions, weights, normals, variances, fates)
             i += 1
     return n, n_rows
+
+
+@compiled
+def gather(tables: tuple[IntArray, ...], starts: IntArray, chosen: IntArray, found: IntArray) -> None:
+    """Rows (n, words) by their numbers (n,) in all tables one after the other; `starts` holds the number at which each begins, and their end."""
+    for k in range(chosen.shape[0]):
+        at, beyond = 0, starts.shape[0] - 1
+        while beyond - at > 1:
+            middle = (at + beyond) // 2
+            if starts[middle] <= chosen[k]:
+                at = middle
+            else:
+                beyond = middle
+        table, row = tables[at], chosen[k] - starts[at]
+        for word in range(found.shape[1]):
+            found[k, word] = table[row, word]
 
 
 @compiled

@@ -5,6 +5,11 @@ rad). What is believed of all of them beforehand is one Gaussian: the calibratio
 poses alike, and the pose noise of each scan. Overlapping scans are registered in pairs by GICP (Segal, Haehnel, Thrun
 2009; library small_gicp); a pair tells x_source - x_target, with the information that its surface holds (a plane tells
 nothing of sliding along it). The pose graph is linear, and its solution is the mean of that Gaussian given the pairs.
+
+A pair of thousands of points would be believed to a micrometre, which no pair is worth: errors of the camera's field bend
+a scan, neighbours share them, and registration takes a bend for a motion. So each patch of a scan counts once with what
+the calibration says of that (`_bend_variance_mm2`, its expanded uncertainty), and pairs that contradict each other more than all
+that allows are believed less by the ratio (R. T. Birge, Phys. Rev. 40, 1932).
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibrate.normal import PATCHES
 from drivers.errors import SettingsError
 from drivers.files.session import Shot
 from drivers.kinematics import se3
@@ -35,6 +41,9 @@ _LEAST_POINTS = 200
 _REACH_MM = 3.0
 _BOUND = 27.9
 """Of the squared Mahalanobis distance of a scan's motion: 99.99 % of a Gaussian in six dimensions."""
+_COVERAGE = 2.0
+_NODES_MM = np.array([[x, y, z] for x in (-50.0, 0.0, 50.0) for y in (-50.0, 0.0, 50.0) for z in (-25.0, 0.0, 25.0)])
+"""About the middle of a scan, where its bend is looked at."""
 _LEVERS_MM = np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [0.0, 40.0, 0.0], [0.0, 0.0, 40.0]])
 
 
@@ -119,18 +128,13 @@ def refine(system: StitchingSystem, surfaces: Sequence[ScanSurface]) -> Refineme
     centre = np.mean([s.points_in_base_mm.mean(axis=0) for s in scans], axis=0)
     prior = _prior(system, scans, centre)
     pairs = _overlapping(scans)
-    information, gradient = np.zeros_like(prior), np.zeros(len(prior))
-    matched = []
+    bends = [_bend_variance_mm2(system, scan) for scan in scans]
+    links = []
     for target, source in pairs:
-        twist, weight, match = _registered(library, system, scans[target], scans[source], centre)
-        matched.append((target, source, *match))
-        a, b = slice(6 * target, 6 * target + 6), slice(6 * source, 6 * source + 6)
-        for one, sign_one in ((a, -1.0), (b, 1.0)):
-            gradient[one] += sign_one * weight @ twist
-            for other, sign_other in ((a, -1.0), (b, 1.0)):
-                information[one, other] += sign_one * sign_other * weight
-    solved = prior @ np.linalg.solve(np.eye(len(prior)) + information @ prior, gradient)
-    motions, bounded = _bounded(solved.reshape(-1, 6), prior)
+        twist, weight, match = _registered(library, system, scans[target], scans[source], centre, (bends[target] + bends[source]) / 2)
+        links.append(_Link(target, source, twist, weight, match))
+    motions, bounded = _bounded(_likeliest(links, prior), prior)
+    matched = [(link.target, link.source, *link.match) for link in links]
     still = np.zeros_like(motions)
     return Refinement(
         motions={s.shot.index: _matrix(motion, centre) for s, motion in zip(scans, motions, strict=True)},
@@ -140,6 +144,54 @@ def refine(system: StitchingSystem, surfaces: Sequence[ScanSurface]) -> Refineme
         disagreement_before_mm=_disagreement_mm(scans, matched, still, centre),
         disagreement_after_mm=_disagreement_mm(scans, matched, motions, centre),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Link:
+    """What a registered pair tells."""
+
+    target: int
+    source: int
+    twist: FloatArray
+    """(6,) of the source less that of the target."""
+    weight: FloatArray
+    """(6, 6) information."""
+    match: tuple[IntArray, IntArray]
+    """Rows of the source, and of the target."""
+
+
+def _likeliest(links: Sequence[_Link], prior: FloatArray) -> FloatArray:
+    """(m, 6) mean of the Gaussian of covariance `prior` (6 m, 6 m) given the pairs."""
+    information, gradient = np.zeros_like(prior), np.zeros(len(prior))
+    for link in links:
+        a, b = (slice(6 * at, 6 * at + 6) for at in (link.target, link.source))
+        for one, sign_one in ((a, -1.0), (b, 1.0)):
+            gradient[one] += sign_one * link.weight @ link.twist
+            for other, sign_other in ((a, -1.0), (b, 1.0)):
+                information[one, other] += sign_one * sign_other * link.weight
+
+    def given(share: float) -> FloatArray:
+        return np.asarray(prior @ np.linalg.solve(np.eye(len(prior)) + share * information @ prior, share * gradient)).reshape(-1, 6)
+
+    motions = given(1.0)
+    left = [link.twist - (motions[link.source] - motions[link.target]) for link in links]
+    squares = sum(float(one @ link.weight @ one) for one, link in zip(left, links, strict=True))
+    n_told = float(np.trace(np.linalg.solve(np.eye(len(prior)) + prior @ information, prior @ information)))
+    ratio = squares / max(6 * len(links) - n_told, 1.0)
+    return given(1.0 / ratio) if ratio > 1.0 else motions
+
+
+def _bend_variance_mm2(system: StitchingSystem, scan: ScanSurface) -> float:
+    """Variance of a coordinate by what of the calibration's error is no rigid motion of the scan, taken at its expanded uncertainty."""
+    pose = {"base_from_flange": scan.shot.base_from_flange} if system.model is None else {"joints_rad": scan.shot.joints_rad}
+    nodes = scan.middle_in_camera_mm + _NODES_MM
+    places = system.points_in_base_mm(nodes, **pose)
+    moved = system.point_jacobian(nodes, **pose).reshape(3 * len(nodes), -1)
+    levers = places - places.mean(axis=0)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(nodes), 3, 3)), -se3.hat(levers)], axis=-1).reshape(-1, 6) * _SCALE
+    bent = moved - rigid @ np.linalg.lstsq(rigid, moved, rcond=None)[0]
+    used = system.covariance[: bent.shape[1], : bent.shape[1]]
+    return _COVERAGE**2 * float(np.einsum("ij,jk,ik->i", bent, used, bent).mean())
 
 
 def _prior(system: StitchingSystem, scans: Sequence[ScanSurface], centre: FloatArray) -> FloatArray:
@@ -171,9 +223,7 @@ _SCALE = np.array([1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2])
 def _overlapping(scans: Sequence[ScanSurface]) -> list[tuple[int, int]]:
     """Pairs of scans that share surface, for each scan those that share most."""
     cells = [set(map(tuple, np.floor(s.points_in_base_mm / _OVERLAP_VOXEL_MM).astype(np.int64).tolist())) for s in scans]
-    shared = {
-        (i, j): len(cells[i] & cells[j]) / min(len(cells[i]), len(cells[j])) for i, j in itertools.combinations(range(len(scans)), 2)
-    }
+    shared = {(i, j): len(cells[i] & cells[j]) / min(len(cells[i]), len(cells[j])) for i, j in itertools.combinations(range(len(scans)), 2)}
     chosen: set[tuple[int, int]] = set()
     for i in range(len(scans)):
         mine = sorted((pair for pair in shared if i in pair and shared[pair] >= _LEAST_OVERLAP), key=lambda pair: (-shared[pair], pair))
@@ -182,7 +232,7 @@ def _overlapping(scans: Sequence[ScanSurface]) -> list[tuple[int, int]]:
 
 
 def _registered(
-    library: Any, system: StitchingSystem, target: ScanSurface, source: ScanSurface, centre: FloatArray
+    library: Any, system: StitchingSystem, target: ScanSurface, source: ScanSurface, centre: FloatArray, bend_variance_mm2: float
 ) -> tuple[FloatArray, FloatArray, tuple[IntArray, IntArray]]:
     """The motion (6,) that brings the source to the target, its information (6, 6), and matched rows of source and target."""
     from scipy.spatial import cKDTree
@@ -200,8 +250,9 @@ def _registered(
     rows = rows[(source.normals[rows] * target.normals[row[rows]]).sum(axis=1) > 0.8]
     normals = source.normals[rows]
     lever = np.concatenate([normals, np.cross(shifted[1][rows], normals)], axis=1)
-    n = np.array([max(len(rows), 1.0)])
-    weight = system.noise.point_weight(n)[0] / 2.0
+    n = max(len(rows), 1)
+    variance_mm2 = 1.0 / float(system.noise.point_weight(np.array([float(n)]))[0]) + n / PATCHES * bend_variance_mm2
+    weight = 0.5 / variance_mm2
     return twist, np.asarray(weight * lever.T @ lever), (rows, row[rows])
 
 

@@ -121,7 +121,7 @@ def test_from_twelve_scans_on_disk_to_the_verdict(case: Case) -> None:
 
 def test_the_whole_command(case: Case) -> None:
     """Start of Python, imports, verdict and its tables; told and not judged: most of it is the start."""
-    words = [COMMAND, "inspect", case.session.folder, case.folder / "nominal.stl", "--spec", case.folder / "inspection.yaml"]
+    words: list[str | Path] = [COMMAND, "inspect", case.session.folder, case.folder / "nominal.stl", "--spec", case.folder / "inspection.yaml"]
     words += ["--calibration", case.folder / "calibration.yaml", "-o", case.folder / "out", "--no-map", "--json", "-q"]
     for _ in range(N_RUNS):
         began = perf_counter()

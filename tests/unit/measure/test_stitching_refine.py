@@ -17,7 +17,7 @@ from drivers.files.session import read_session
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.stitch import StitchSettings, stitch
-from measure.stitching.refine import Refinement, ScanSurface, refine, surface_of
+from measure.stitching.refine import Refinement, ScanSurface, _bend_variance_mm2, _likeliest, _Link, refine, surface_of
 from measure.stitching.scan import DEFAULT_CLEANING, prepare_scan
 from tests.support.organised import OrganisedCell, organised_cell
 
@@ -117,3 +117,37 @@ def test_a_missing_library_is_told_before_any_work(cell: OrganisedCell, tmp_path
     with pytest.raises(SettingsError, match=r"small_gicp.*spherecal\[registration\]"):
         stitch(cell.calibration, session, tmp_path / "cloud.ply", settings=StitchSettings(refine=True))
     assert not list(tmp_path.iterdir())
+
+
+def test_pairs_that_contradict_each_other_are_believed_less() -> None:
+    prior = np.kron(np.eye(3), np.diag([0.1**2] * 3 + [1e-3**2] * 3)).astype(np.float64)
+    weight = np.diag([1e4] * 3 + [1e8] * 3).astype(np.float64)
+    moved = np.zeros((3, 6))
+    moved[1, 0], moved[2, 1] = 0.05, -0.04
+
+    def links(error_mm: float) -> list[_Link]:
+        none = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+        found = [_Link(a, b, moved[b] - moved[a], weight, none) for a, b in ((0, 1), (1, 2), (0, 2))]
+        return [replace(found[0], twist=found[0].twist + np.array([0, 0, error_mm, 0, 0, 0])), *found[1:]]
+
+    agreed = _likeliest(links(0.0), prior)
+    between = agreed - agreed[0]
+    np.testing.assert_allclose(between[:, :2], moved[:, :2], atol=2e-3)
+    torn = _likeliest(links(0.5), prior)
+    # half a millimetre round the circle is fifty times what the pairs claim: less is left of what they say of x too
+    assert np.abs(torn[1, 0] - torn[0, 0]) < 0.75 * np.abs(between[1, 0])
+
+
+def test_what_bends_a_scan_is_not_taken_for_its_motion(cell: OrganisedCell) -> None:
+    """A rigid error of the calibration is no bend, one of the camera's field is."""
+    calibration = cell.calibration
+    surface = surfaces(cell, calibration, np.zeros((N_SCANS, 6)))[0]
+    n_rigid = calibration.link_twists.size + 6
+    blocks = {"rigid": slice(0, n_rigid), "field": slice(n_rigid, n_rigid + len(calibration.camera_mm))}
+    found = {}
+    for name, block in blocks.items():
+        covariance = np.zeros_like(calibration.covariance)
+        covariance[block, block] = np.diag(np.full(len(range(*block.indices(len(covariance)))), 0.01**2))
+        found[name] = _bend_variance_mm2(replace(calibration, covariance=covariance), surface)
+    assert found["rigid"] < 1e-10
+    assert found["field"] > 1e-5
