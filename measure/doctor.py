@@ -17,6 +17,7 @@ from drivers.kinematics import mdh, se3
 from drivers.kinematics.mdh import RobotModel
 from drivers.models import load_robot_model, shipped_models
 from drivers.protocols import Camera3D, Mode, Robot, RobotState
+from drivers.registry import hardware_remark, untried_drivers
 from measure.doctor_camera import camera_hints, frame_facts, health_facts, identity_problems, info_facts
 
 Facts: TypeAlias = dict[str, object]
@@ -88,7 +89,7 @@ def cell_hints(cell: Cell, model: RobotModel | None) -> list[str]:
     without = [name for name, sphere in cell.spheres.items() if sphere.centre_in_base_mm is None]
     if without and model is not None:
         hints.append(f"spheres {', '.join(without)}: no centre_in_base_mm, so no poses are planned around them")
-    return hints
+    return [*hints, *map(hardware_remark, untried_drivers(cell.robot.driver, cell.camera.driver))]
 
 
 def examine_robot(robot: Robot, model: RobotModel | None, diagnosis: Diagnosis) -> None:

@@ -62,6 +62,7 @@ class TestDoctor:
         assert "PolyScope 5" in robot["controller"]
         assert 0 <= robot["age_s"] < 0.05
         assert any("own calibration" in hint for hint in robot["hints"])
+        assert any("ur_rtde has never run on hardware" in hint for hint in robot["hints"])
         assert controller.n_motions() == count
         assert controller.bench.ask("axes")  # still there
 
