@@ -57,6 +57,7 @@ def tell_verification(console: Console, result: VerifyResult) -> None:
     ]
     if rows:
         console.table("lengths, mm", ["between", "measured", "certified", "error", "U (k=2)", "not judged"], rows)
+    tell_spheres(console, result)
     tell_probing(console, result)
     tell_slides(console, result)
     if result.external is not None:
@@ -67,6 +68,17 @@ def tell_verification(console: Console, result: VerifyResult) -> None:
     for warning in result.warnings:
         console.note(f"warning: {warning}")
     tell_verdict(console, result.verdict, result.reasons)
+
+
+def tell_spheres(console: Console, result: VerifyResult) -> None:
+    """Diameter and form (95 %) of every sphere stitched from all its views, each with its U."""
+    rows: list[list[object]] = []
+    for name, sphere in result.figures.spheres.items():
+        u = result.sphere_uncertainties[name]
+        rows.append([name, str(sphere.n_views), f"{sphere.diameter_error_mm:+.3f}", u.diameter_expanded_mm, sphere.form_mm, u.form_expanded_mm])
+    if rows:
+        heads = ["sphere", "views", "diameter error", "U (k=2)", "form 95 %", "U (k=2)"]
+        console.table("spheres stitched from all views, mm", heads, rows)
 
 
 def tell_probing(console: Console, result: VerifyResult) -> None:
