@@ -24,7 +24,7 @@ from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.coverage import Coverage, coverage_of, on_seen_sectors
 from measure.inspecting.patches import CELLS_ACROSS, COARSE_CELLS_ACROSS, Division, IntArray, PatchSums, Scatter, patches_of, scatters_of
 from measure.inspecting.robust import fit_step, robust_fit
-from measure.inspecting.shapes import ConeShape, Distances, Shape, StadiumShape
+from measure.inspecting.shapes import ConeShape, Distances, PlaneShape, Shape, StadiumShape
 from measure.inspecting.strays import Mixture
 
 _CUT = 4.0
@@ -213,8 +213,12 @@ def _patch_motion(gradient: FloatArray, weights: FloatArray, formed: IntArray, l
 def response_patches(shape: Shape, in_part_mm: FloatArray) -> tuple[IntArray, float]:
     """Patches (n,) of points (n, 3) that a fit's response is given by, and their size in mm.
 
-    Those of round walls are smaller: a wall turns away within a patch, and the views that see it change with it.
+    Those of round walls are smaller: a wall turns away within a patch, and the views that see it change with it. Those of
+    planes are as many across as along: the two ends of a narrow side may be seen by different views, which tilts it.
     """
+    if isinstance(shape, PlaneShape):
+        in_plane = se3.apply(shape.local_from_part, in_part_mm) * [1.0, 1.0, 0.0]
+        return patches_of(in_plane, along_each_axis=True)
     return patches_of(in_part_mm, _CELLS_OF_WALLS if isinstance(shape, ConeShape | StadiumShape) else CELLS_ACROSS)
 
 

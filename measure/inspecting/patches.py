@@ -40,15 +40,22 @@ class PatchSums:
         return np.asarray(self.total(values * self._weights[:, None]) / self.weights[:, None])
 
 
-def patches_of(points_mm: FloatArray, cells_across: int = CELLS_ACROSS) -> tuple[IntArray, float]:
-    """Cubes of a grid as patches: labels (n,) from 0 without gaps, and the edge of a cube."""
+def patches_of(points_mm: FloatArray, cells_across: int = CELLS_ACROSS, *, along_each_axis: bool = False) -> tuple[IntArray, float]:
+    """Cells of a grid as patches: labels (n,) from 0 without gaps, and the longest edge of a cell.
+
+    Args:
+        points_mm: (n, 3).
+        cells_across: along the longest side of the points' box; the cells are cubes.
+        along_each_axis: that many along every side instead.
+    """
     low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    size = max(float((high - low).max()) / cells_across, 1e-6)
-    cells = np.minimum(np.floor((points_mm - low) / size), cells_across - 1).astype(np.int64)
+    sides = (high - low) if along_each_axis else np.full(3, float((high - low).max()))
+    sizes = np.maximum(sides / cells_across, 1e-6)
+    cells = np.minimum(np.floor((points_mm - low) / sizes), cells_across - 1).astype(np.int64)
     keys = (cells[:, 0] * cells_across + cells[:, 1]) * cells_across + cells[:, 2]
     taken = np.zeros(cells_across**3, dtype=np.int64)
     taken[keys] = 1
-    return (np.cumsum(taken) - 1)[keys], size
+    return (np.cumsum(taken) - 1)[keys], float(sizes.max())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -71,3 +71,16 @@ def test_views_that_differ_more_than_the_calibration_s_pose_noise_are_taken_at_t
         found.append(np.sqrt(field.covariance[-1, -1]) / PERFECT.noise.pose_rad)
     assert np.mean(found) == pytest.approx(times, rel=0.25)
     assert min(found) >= 1.0
+
+
+def test_two_views_that_see_the_two_halves_of_a_narrow_wall_tilt_it() -> None:
+    """A line through a step d in the middle of a height h has the slope 1.5 d / h."""
+    rng = np.random.default_rng(11)
+    wall = np.column_stack([rng.normal(0, 0.02, 4000), rng.uniform(-50, 50, 4000), rng.uniform(-8, 8, 4000)])
+    place = np.array([-60.0, 0.0, 350.0])
+    shape = PlaneShape(frame_about([0, 0, 0], [-1, 0, 0], [0, 1, 0]), (50.0, 8.0), 2.0)
+    fit = fit_shape(shape, FitPoints(wall, np.ones(len(wall)), np.arange(len(wall))), name="wall")
+    halves = [view(wall[wall[:, 2] > 0], place), view(wall[wall[:, 2] < 0], place)]
+    (covariance,) = seen_field(PERFECT, halves, [fit.response], np.eye(4)).covariances([fit.response])
+    whole = np.hypot(PERFECT.noise.pose_mm, PERFECT.noise.pose_rad * 350.0)
+    assert np.sqrt(covariance[2, 2]) == pytest.approx(1.5 * np.sqrt(2) * whole / 16, rel=0.15)
