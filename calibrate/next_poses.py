@@ -59,8 +59,12 @@ def shortcomings(problem: Problem, solution: Solution, expected_rank: int) -> tu
         few, poses = f"{problem.n_shots}", f"{n_views} distinct pose{'s' * (n_views != 1)}"
         what = f"too few shots: {few}" if n_views == problem.n_shots else f"too few poses: the {few} shots are of {poses} only,"
         found.append(f"{what} for {n_sought} unknowns, each tells three numbers; take {max(_ENOUGH_SHOTS, n_sought)} or more")
-    if not problem.n_shots:
-        return tuple(found)
+    return tuple(found) + (alike(problem, solution) + tuple(_still_axes(problem)) if problem.n_shots else ())
+
+
+def alike(problem: Problem, solution: Solution) -> tuple[str, ...]:
+    """In what all shots of a problem are alike, with what to do: places in the camera's view, orientations."""
+    found: list[str] = []
     seen = solution.geometry.centre_in_camera_mm
     if seen.std(axis=0).max() < _ONE_PLACE_SHARE * seen[:, 2].mean():
         depths = f"depth {seen[:, 2].min():.0f} to {seen[:, 2].max():.0f} mm"
@@ -69,7 +73,7 @@ def shortcomings(problem: Problem, solution: Solution, expected_rank: int) -> tu
     if turned[1] < _ONE_ORIENTATION_RAD:
         how = "the camera was hardly turned between shots (parallel orientations)" if turned[2] < _ONE_ORIENTATION_RAD else _ONE_AXIS
         found.append(f"{how}: tilt it by 20 to 40 degrees to all sides, and roll it about its view")
-    return tuple(found + _still_axes(problem))
+    return tuple(found)
 
 
 _ONE_AXIS = "the camera was turned about one axis only"

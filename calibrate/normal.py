@@ -262,7 +262,7 @@ def physical_precision(problem: Problem) -> FloatArray:
     return precision
 
 
-def _gauge_precision(model: CameraError) -> FloatArray:
+def gauge_precision(model: CameraError) -> FloatArray:
     """(k, k) inverse variances that hold what a camera field turns every point by: the hand-eye transform turns them as well.
 
     The priors alone choose among the fields that differ by a turn, N, and they choose the one with N' P c = 0. They are so
@@ -293,5 +293,5 @@ def _priors(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     value[layout.radius_offset] = state.radius_offset_mm
     value[layout.sphere_radius] = state.sphere_radius_deviation_mm
     hessian = np.diag(precision)
-    hessian[layout.camera, layout.camera] += _gauge_precision(problem.camera_error)
+    hessian[layout.camera, layout.camera] += gauge_precision(problem.camera_error)
     return hessian, value

@@ -25,7 +25,7 @@ from calibrate.design_shots import Expectation
 from calibrate.external_result import external_names, external_result
 from calibrate.external_solve import predicted_rms_mm, rms_mm
 from calibrate.identifiability import identifiability_of, parameter_names
-from calibrate.next_poses import Taken, next_best_poses, pose_text, shortcomings
+from calibrate.next_poses import Taken, alike, next_best_poses, pose_text, shortcomings
 from calibrate.observations import RejectedShot
 from calibrate.problem import Problem
 from calibrate.provenance import identity_of, inputs_of
@@ -151,6 +151,7 @@ def make_result(
         covariance_scale=scale,
         external_rms_mm=external_rms if np.isfinite(external_rms) else None,
         shortcomings=shortcomings(problem, solution, identifiability.expected_rank),
+        alike=alike(problem, solution) if has_joints and not line_profile and problem.n_shots else (),
         unseen_branch=unseen_branch(problem, solution, covariance),
         camera_misfit=solved.misfit,
     )

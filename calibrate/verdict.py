@@ -37,6 +37,8 @@ class Evidence:
     """Rms of held-out external points; None without any."""
     shortcomings: tuple[str, ...] = ()
     """What the shots are too few or too alike in, with what to do."""
+    alike: tuple[str, ...] = ()
+    """In what all shots are alike, where an area camera and the robot are calibrated."""
     held: bool = False
     """Whether the solve came to rest only with its unknowns held back."""
     radius_offset_mm: float = 0.0
@@ -62,7 +64,7 @@ def judge(evidence: Evidence, identifiability: Identifiability) -> tuple[str, tu
 
 def wants_more_poses(evidence: Evidence, identifiability: Identifiability) -> bool:
     """Whether further poses would cure what is held against a calibration."""
-    return identifiability.rank < identifiability.expected_rank or _one_branch(evidence) or _unsure_length(evidence)
+    return identifiability.rank < identifiability.expected_rank or bool(evidence.alike) or _one_branch(evidence) or _unsure_length(evidence)
 
 
 def _one_branch(e: Evidence) -> bool:
@@ -94,6 +96,9 @@ def _grave(e: Evidence, identifiability: Identifiability) -> list[str]:
             f"the shots leave {missing} of {identifiability.expected_rank} directions open (rank {identifiability.rank}){_open(identifiability)}: "
             + "; ".join(e.shortcomings or (_SPREAD,))
         )
+    elif e.alike:
+        # points of a cap tell a little of everything, so that no direction counts as open; which camera model is true they do not tell
+        found.append(f"robot, hand-eye and camera are hardly told apart: {'; '.join(e.alike)}")
     if _one_branch(e) and e.unseen_branch is not None and e.limits is not None:
         found.append(
             f"the shots hold the arm in one branch: measured with the {e.unseen_branch.text}, which the robot can, a place would be off by up to "

@@ -186,16 +186,17 @@ def _one_place(rng: np.random.Generator, depth_mm: tuple[float, float]) -> tuple
     return np.array([5.0, -3.0, 330.0]) + rng.normal(0, 0.3, 3), draw_view(rng, depth_mm)[1]
 
 
-def test_a_degenerate_plan_fails_with_its_reason_whatever_camera_model_is_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Free, the solve wanders along what the shots leave open and never ends; `auto` must come to a verdict all the same.
+@pytest.mark.parametrize("seed", [9, 10, 11])
+def test_a_degenerate_plan_fails_with_its_reason_whatever_camera_model_is_tried(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Caps tell a little of everything, so that `auto` takes one model or another and the solve ends: the verdict must see through it.
 
     Repeated poses are test_distinct_views.py's.
     """
-    cell, rng = paper_cell(coupled=True), np.random.default_rng(9)
+    cell, rng = paper_cell(coupled=True), np.random.default_rng(seed)
     monkeypatch.setattr("tests.support.synthetic.draw_view", _one_place)
     shots = draw_shots(cell, rng, 40, n_points=400)
     folder = write_session(tmp_path / "s", cell, {"A": shots}, flange_from_camera=cell.flange_from_camera)
     found = calibrate([read_session(folder)])
     assert found.verdict == "fail", found.reasons
-    assert any("directions open" in reason or "determine so little" in reason for reason in found.reasons), found.reasons
+    assert "one place of the camera's view" in found.reasons[0], found.reasons
     assert found.statistics.used + len(found.rejected) == len(shots)
