@@ -15,6 +15,7 @@ from acquire.poses import PoseLaw, sphere_candidates
 from acquire.visibility import camera_view
 from calibrate.check_design import LARGEST_TILT_RAD, CheckDesign, choose_check_poses
 from calibrate.drift_causes import BOW_AT_MM, Diagnosis, causes_of, diagnose
+from calibrate.drift_pairs import Together, two_causes
 from calibrate.observations import SphereShot
 from calibrate.quick_check import check_residuals, known_state
 from calibrate.result import Calibration
@@ -143,9 +144,16 @@ def bowed(shot: SphereShot, bow_mm: float) -> SphereShot:
 
 def diagnosis_of(checked: CheckedCell, shots: Sequence[SphereShot]) -> Diagnosis:
     """What a check says of some shots."""
+    return told_of(checked, shots)[0]
+
+
+def told_of(checked: CheckedCell, shots: Sequence[SphereShot]) -> tuple[Diagnosis, Together | None]:
+    """The same, and whether two causes are told."""
     residuals = check_residuals(checked.calibration, shots)
     state = known_state(checked.calibration, residuals.problem.n_scans)
-    return diagnose(residuals, causes_of(residuals, state, tuple(checked.calibration.sphere_centres_in_base_mm)))
+    causes = causes_of(residuals, state, tuple(checked.calibration.sphere_centres_in_base_mm))
+    diagnosis = diagnose(residuals, causes)
+    return diagnosis, two_causes(residuals, causes, diagnosis)
 
 
 def _moved(sphere: SphereTruth, shift: FloatArray) -> SphereTruth:

@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 
 from calibrate.check_design import clarity, ideal_shots
-from calibrate.drift_causes import HAND_EYE, SPHERE, Cause, Diagnosis, causes_of, diagnose, named
-from calibrate.drift_pairs import two_causes
+from calibrate.drift_causes import HAND_EYE, SPHERE, causes_of, named
 from calibrate.few_parameters import resolve
 from calibrate.observations import SphereShot
-from calibrate.quick_check import CheckResiduals, changes_since, check_residuals, known_state
+from calibrate.quick_check import changes_since, check_residuals, known_state
 from calibrate.result import Calibration
 from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.quick.since import since_earlier
-from tests.support.drifting import CheckedCell, after_two, check_shots, diagnosis_of, small_checked_cell
+from tests.support.drifting import CheckedCell, after_two, check_shots, diagnosis_of, small_checked_cell, told_of
 from tests.support.volume import DIAMETER_MM
 
 SEED = 61_001
@@ -96,22 +95,13 @@ def test_one_spoiled_shot_is_told_as_that(checked: CheckedCell) -> None:
 
 def test_two_changes_at_once_are_told_as_two(checked: CheckedCell) -> None:
     causes = ("axis 3", SPHERE)
-    found, residuals, all_causes = diagnosed(checked, after_two(checked, causes, np.random.default_rng([SEED, 8]), size=4.0))
-    together = two_causes(residuals, all_causes, found)
+    _, together = told_of(checked, after_two(checked, causes, np.random.default_rng([SEED, 8]), size=4.0))
     assert together is not None
     assert together.log_odds > np.log(1e4)
     assert {*together.pairs[0].causes} == {*causes}
     assert sum(pair.probability for pair in together.pairs) <= 1.0
     for cause in (None, "axis 3", "hand-eye", SPHERE):
-        found, residuals, all_causes = diagnosed(checked, shots_after(checked, cause, size=2.0, seed=9))
-        assert two_causes(residuals, all_causes, found) is None, cause
-
-
-def diagnosed(checked: CheckedCell, shots: list[SphereShot]) -> tuple[Diagnosis, CheckResiduals, tuple[Cause, ...]]:
-    residuals = check_residuals(checked.calibration, shots)
-    state = known_state(checked.calibration, residuals.problem.n_scans)
-    causes = causes_of(residuals, state, tuple(checked.calibration.sphere_centres_in_base_mm))
-    return diagnose(residuals, causes), residuals, causes
+        assert told_of(checked, shots_after(checked, cause, size=2.0, seed=9))[1] is None, cause
 
 
 def test_an_earlier_check_takes_out_what_the_calibration_leaves(checked: CheckedCell) -> None:
