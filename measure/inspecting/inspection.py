@@ -26,6 +26,7 @@ from measure.inspecting.region import WIDER
 from measure.inspecting.result import AlignmentResult, CheckResult, DeviationMap, Inspection
 from measure.inspecting.spec import InspectionSpec, ProfileCheck
 from measure.inspecting.uncertainty import FieldError, JointCovariance, StatedField, UnknownField, joint_covariance, residual_covariances
+from measure.inspecting.units import require_features_on, require_likely_units
 from measure.inspecting.views import FieldSource
 
 _DATUM_ROUNDS = 3
@@ -69,6 +70,7 @@ def inspect_cloud(
     """
     began = time.perf_counter()
     require_likely_units(cloud, nominal)
+    require_features_on(nominal, spec)
     require_checks_fit(spec, {name: shape_of(feature) for name, feature in spec.features.items()})
     profile = any(isinstance(check, ProfileCheck) for check in spec.checks)
     surface = NominalSurface.of(nominal) if profile or spec.alignment.method == "best_fit" else None
@@ -130,32 +132,6 @@ def with_deviations(
         return inspection
     mapped = _deviations(cloud, surface or NominalSurface.of(nominal), inspection.alignment.part_from_base, spec)
     return replace(inspection, deviations=mapped)
-
-
-def require_likely_units(cloud: MeasuredCloud, nominal: Nominal) -> None:
-    """Refuse a cloud and a nominal whose sizes differ as units do.
-
-    Raises:
-        DataError: factor 1000 or 25.4 between them.
-    """
-    low, high = np.quantile(cloud.points_mm, [0.005, 0.995], axis=0)
-    sizes, drawn = np.sort(high - low), np.sort(np.ptp(nominal.box_mm, axis=0))
-    ratio = float(sizes[-1] / max(drawn[-1], 1e-9))
-    if ratio < 1 / 200:
-        raise DataError(
-            f"the cloud is {sizes[-1]:.3g} long, the nominal {drawn[-1]:.3g}: the cloud is probably in metres",
-            file=cloud.file,
-            remedy="Clouds and nominals are in mm.",
-        )
-    if ratio > 200:
-        raise DataError(
-            f"the cloud is {sizes[-1]:.3g} mm long, the nominal {drawn[-1]:.3g}: the nominal is probably in metres",
-            file=nominal.file,
-            remedy="Export it in mm.",
-        )
-    for factor, words in ((25.4, "the nominal is probably in inches"), (1 / 25.4, "the cloud is probably in inches")):
-        if np.allclose(sizes / np.maximum(drawn, 1e-9), factor, rtol=0.03):
-            raise DataError(f"the cloud is {ratio:.3g} times as large as the nominal in every direction: {words}", file=cloud.file, remedy="Use mm.")
 
 
 def _align(cloud: MeasuredCloud, spec: InspectionSpec, surface: NominalSurface | None) -> _Aligned:

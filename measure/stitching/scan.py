@@ -24,8 +24,10 @@ _COVARIANCE_EVERY = 8
 """Pixels of a row that share one covariance: it changes over centimetres."""
 _REFERENCE_LEVER_MM = 500.0
 _LINES_LOOKED_AT = 32
-_SMALLEST_SCAN_MM = 20.0
-_LARGEST_SCAN_MM = 20_000.0
+_FAR_OFF = 3.0
+_ANY_DEPTH_MM = (100.0, 4000.0)
+"""Taken where the calibration saw nothing: external points alone."""
+_UNITS = {"metres": 1e3, "inches": 25.4, "centimetres": 10.0, "tenths of a millimetre": 0.1, "micrometres": 1e-3}
 
 
 class KnowsItsErrors(MeasuringSystem, KnowsItsCovariance, Protocol):
@@ -47,6 +49,11 @@ class StitchingSystem(KnowsItsErrors, Protocol):
     @property
     def flange_from_camera(self) -> FloatArray:
         """(4, 4)."""
+        ...
+
+    @property
+    def camera_seen_volume_mm(self) -> FloatArray:
+        """(2, 3) lower and upper corner of the part of the camera frame in which points were seen."""
         ...
 
 
@@ -102,7 +109,8 @@ def prepare_scan(system: StitchingSystem, session: Session, shot: Shot, cloud: P
     from measure.stitching import scan_kernels as kernels
 
     in_camera = _as_grid(cloud.xyz_mm)
-    require_mm(in_camera, session, shot)
+    low, high = system.camera_seen_volume_mm
+    require_likely(in_camera, (float(low[2]), float(high[2])), session, shot)
     height, width = in_camera.shape[:2]
     in_base = points_of_shot_in_base_mm(system, session, shot, in_camera.reshape(-1, 3)).reshape(height, width, 3)
     view, noise = _view(system, shot), _point_noise(system.noise)
@@ -133,26 +141,39 @@ def _as_grid(xyz_mm: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(grid)
 
 
-def require_mm(in_camera: NDArray[np.float32], session: Session, shot: Shot) -> None:
-    """Refuse scans that are plainly in another unit.
+def require_likely(in_camera: NDArray[np.float32], seen_depth_mm: tuple[float, float], session: Session, shot: Shot) -> None:
+    """Refuse scans that are plainly in another unit, or of another axis order.
+
+    Args:
+        in_camera: (h, w, 3).
+        seen_depth_mm: least and greatest depth at which the calibration saw anything; equal where it saw nothing.
+        session: that the shot belongs to, for the error.
+        shot: of the scan, for the error.
 
     Raises:
-        DataError: all points lie within 20 mm of the camera, or beyond 20 m.
+        DataError: most points lie behind the camera, or three times nearer or farther than anything that was calibrated.
     """
-    # a look at some points clears nearly every scan
-    for part in (in_camera.reshape(-1, 3)[::97], in_camera.reshape(-1, 3)):
-        size = np.abs(part).max(axis=1)
-        size = size[np.isfinite(size)]
-        if len(size) and size.max() >= _SMALLEST_SCAN_MM and size.min() <= _LARGEST_SCAN_MM:
-            return
-    if len(size):
-        metres = size.max() < _SMALLEST_SCAN_MM
-        where = f"within {_SMALLEST_SCAN_MM:g} mm of" if metres else f"more than {_LARGEST_SCAN_MM / 1000:g} m from"
+    depth = in_camera.reshape(-1, 3)[:: max(1, in_camera.size // 30_000)].astype(np.float64)
+    depth = depth[np.isfinite(depth).all(axis=1), 2]
+    if not len(depth):  # only a few points of many are valid
+        depth = in_camera[np.isfinite(in_camera).all(axis=-1)][:, 2].astype(np.float64)
+    middle = float(np.median(depth)) if len(depth) else float("nan")
+    near, far = seen_depth_mm if seen_depth_mm[0] < seen_depth_mm[1] else _ANY_DEPTH_MM
+    if np.isnan(middle) or near / _FAR_OFF <= middle <= far * _FAR_OFF:
+        return
+    if middle <= 0:
         raise DataError(
-            f"the whole scan of shot {shot.index} lies {where} the camera",
+            f"the scan of shot {shot.index} lies at the camera or behind it (z {middle:.3g})",
             file=session.folder / str(shot.scan),
-            remedy=f"It is probably in {'metres' if metres else 'micrometres'}: scans are in mm.",
+            remedy="Is z its line of sight? Holes are NaN, not zero.",
         )
+    ratio = (near * far) ** 0.5 / middle
+    unit, _ = min(_UNITS.items(), key=lambda unit: abs(np.log(ratio / unit[1])))
+    raise DataError(
+        f"the scan of shot {shot.index} lies {middle:.3g} from the camera, which was calibrated from {near:.0f} to {far:.0f} mm",
+        file=session.folder / str(shot.scan),
+        remedy=f"It is probably in {unit}: scans are in mm.",
+    )
 
 
 def _view(system: StitchingSystem, shot: Shot) -> View:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,10 @@ from drivers.registry import hardware_remark
 from drivers.simulated.workpiece_machined import MachinedPart
 from measure.inspecting.cloud import load_cloud
 from measure.inspecting.distance import NominalSurface
-from measure.inspecting.inspection import inspect_cloud, require_likely_units
+from measure.inspecting.inspection import inspect_cloud
 from measure.inspecting.nominal import Nominal, load_nominal
 from measure.inspecting.spec import InspectionSpec, load_spec
+from measure.inspecting.units import require_features_on, require_likely_units
 from tests.support.machined import drawn_spec, measured_cloud, nominal_of
 
 BOX = (60.0, 40.0, 20.0)
@@ -87,12 +89,30 @@ def test_nan_rows_and_far_points_are_dropped_and_what_the_file_states_is_read(tm
 
 
 @pytest.mark.parametrize(
-    ("scale", "words"), [(1e-3, "the cloud is probably in metres"), (1e3, "the nominal is probably in metres"), (25.4, "inches")]
+    ("scale", "words"),
+    [
+        (1e-3, "the cloud is probably in metres"),
+        (1e3, "the nominal is probably in metres"),
+        (25.4, "inches"),
+        (10.0, "nominal is probably in centi"),
+        (0.1, "cloud is probably in centi"),
+    ],
 )
 def test_units_that_differ_between_cloud_and_nominal_are_told(scale: float, words: str, tmp_path: Path) -> None:
     corners = np.random.default_rng(2).uniform(-0.5, 0.5, (4000, 3)) * BOX
     with pytest.raises(DataError, match=words):
         require_likely_units(measured_cloud(corners * scale * 1.01), loaded(tmp_path, box_mesh()))
+
+
+@pytest.mark.parametrize(("scale", "words"), [(1 / 25.4, "in inches"), (0.1, "in centimetres"), (1.0, None)])
+def test_features_that_do_not_lie_on_the_mesh_are_told(scale: float, words: str | None) -> None:
+    drawn = nominal_of(MachinedPart(), 24)
+    mesh = replace(drawn, vertices_mm=drawn.vertices_mm * scale)
+    if words is None:
+        require_features_on(mesh, drawn_spec())
+        return
+    with pytest.raises(FileError, match=words):
+        require_features_on(mesh, drawn_spec())
 
 
 def _invert(mesh: trimesh.Trimesh) -> None:

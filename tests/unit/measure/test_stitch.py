@@ -143,6 +143,10 @@ def one_scan(folder: Path, xyz_mm: FloatImage, *, joints: bool = True) -> Sessio
         (np.full((6, 8, 3), np.nan), True, "no point is left of 0 valid"),
         (np.array([[0.1, 0.2, 0.3]]), True, "probably in metres"),
         (np.array([[1e5, 0.0, 4e5]]), True, "probably in micrometres"),
+        (np.array([[1.0, 2.0, 30.0 / 2.54]]), True, "probably in inches"),
+        (np.array([[1.0, 2.0, 30.0]]), True, "probably in centimetres"),
+        (np.full((40, 40, 3), [0.0, 0.0, -300.0]), True, "behind it"),
+        (np.zeros((40, 40, 3)), True, "Holes are NaN"),
         (np.array([[0.0, 0.0, 300.0]]), False, "no joints"),
     ],
 )
