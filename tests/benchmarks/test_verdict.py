@@ -12,7 +12,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 import pytest
@@ -93,29 +93,36 @@ def on_table(grid_mm: NDArray[np.float32], base_from_camera: FloatArray, rng: np
 
 def test_from_the_last_trigger_to_the_verdict(case: Case) -> None:
     """Eleven scans are fused while the robot moves; counted is what follows the exposure of the twelfth."""
-    times_s = []
+    times_s, cpus_s = [], []
     for _ in range(N_RUNS):
         part = PartInProgress(case.calibration)
         *earlier, last = scans_once(case.session)
         for shot in earlier:
             part.add(case.session, shot, read_scan(case.session, shot))
         cloud = read_scan(case.session, last)
-        began = perf_counter()
+        began, cpu = perf_counter(), process_time()
         part.add(case.session, last, cloud)
         found = part.judged(case.session, case.drawing, Path("out"), began=began)
         times_s.append(perf_counter() - began)
+        cpus_s.append(process_time() - cpu)
     assert len(found.inspection.checks) == 12
-    tell("last trigger to OK / NG, scans fused as they come", min(times_s), f"worst {max(times_s):.2f} s, {found.stitched.n_points} voxels, {load()}")
+    tell(
+        "last trigger to OK / NG, scans fused as they come",
+        min(times_s),
+        f"{min(cpus_s):.2f} s of a core, {found.stitched.n_points} voxels, {load()}",
+    )
     assert min(times_s) < LIMIT_S
 
 
 def test_from_twelve_scans_on_disk_to_the_verdict(case: Case) -> None:
     """Read, digests checked, fused, inspected, in a warm process."""
-    times_s = []
+    times_s, cpus_s = [], []
     for _ in range(N_RUNS):
+        cpu = process_time()
         found = measure_part(case.calibration, case.session, case.drawing, Path("out"))
+        cpus_s.append(process_time() - cpu)
         times_s.append(found.inspection.seconds_to_verdict)
-    tell("12 scans on disk to OK / NG, in one process", min(times_s), f"worst {max(times_s):.2f} s, {load()}")
+    tell("12 scans on disk to OK / NG, in one process", min(times_s), f"{min(cpus_s):.2f} s of the cores, {load()}")
     assert min(times_s) < LIMIT_S
 
 
@@ -123,7 +130,7 @@ def test_the_whole_command(case: Case) -> None:
     """Start of Python, imports, verdict and its tables; told and not judged: most of it is the start."""
     words: list[str | Path] = [COMMAND, "inspect", case.session.folder, case.folder / "nominal.stl", "--spec", case.folder / "inspection.yaml"]
     words += ["--calibration", case.folder / "calibration.yaml", "-o", case.folder / "out", "--no-map", "--json", "-q"]
-    for _ in range(N_RUNS):
+    for _ in range(2):
         began = perf_counter()
         done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=600)
         seconds = perf_counter() - began

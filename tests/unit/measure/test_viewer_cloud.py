@@ -19,6 +19,11 @@ def test_a_cloud_becomes_a_recording(tmp_path: Path, full: bool) -> None:
     assert write_cloud_recording(tmp_path / "cloud.rrd", grid.fused(), title="a cloud") == tmp_path / "cloud.rrd"
     assert [path.name for path in tmp_path.iterdir()] == ["cloud.rrd"]
     assert (tmp_path / "cloud.rrd").read_bytes()[:4] == b"RRF2"
+    from rerun.chunk import RrdReader
+
+    paths = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "cloud.rrd")).stream()}
+    # a cloud of means alone has nothing to be coloured by, and is shown all the same
+    assert {"/legend", "/base/spread" if full else "/base/points"} <= paths
 
 
 def test_a_missing_folder_is_told(tmp_path: Path) -> None:
