@@ -130,42 +130,19 @@ def _new_row(index: NDArray[np.uint32], slot: np.int64, rows: IntArray, n_rows: 
 
 
 @compiled
-def _add_point(
-    rows: IntArray,
-    halves: NDArray[np.int32],
-    row: np.int64,
-    i: int,
-    fractions: NDArray[np.int16],
-    weights: NDArray[np.uint8],
-    normals: NDArray[np.int16],
-    variances: NDArray[np.uint32],
-    fates: IntArray,
-) -> None:
-    if halves[row, WEIGHT] >= WEIGHT_LIMIT:
-        fates[CROWDED] += 1
-        return
-    w = np.int64(weights[i])
+def _add_place(rows: IntArray, row: np.int64, w: np.int64, fractions: NDArray[np.int16], i: int) -> None:
     x, y, z = np.int64(fractions[i, 0]), np.int64(fractions[i, 1]), np.int64(fractions[i, 2])
     wx, wy, wz = w * x, w * y, w * z
-    halves[row, COUNT] += 1
-    halves[row, WEIGHT] += np.int32(w)
     rows[row, SUM] += wx
     rows[row, SUM + 1] += wy
     rows[row, SUM + 2] += wz
-    if rows.shape[1] != FULL_WORDS:
-        return
-    rows[row, MOMENT] += wx * x
-    rows[row, MOMENT + 1] += wx * y
-    rows[row, MOMENT + 2] += wx * z
-    rows[row, MOMENT + 3] += wy * y
-    rows[row, MOMENT + 4] += wy * z
-    rows[row, MOMENT + 5] += wz * z
-    if normals.shape[0]:
-        rows[row, NORMAL] += w * np.int64(normals[i, 0])
-        rows[row, NORMAL + 1] += w * np.int64(normals[i, 1])
-        rows[row, NORMAL + 2] += w * np.int64(normals[i, 2])
-    if variances.shape[0]:
-        rows[row, VARIANCE] += w * np.int64(variances[i])
+    if rows.shape[1] == FULL_WORDS:
+        rows[row, MOMENT] += wx * x
+        rows[row, MOMENT + 1] += wx * y
+        rows[row, MOMENT + 2] += wx * z
+        rows[row, MOMENT + 3] += wy * y
+        rows[row, MOMENT + 4] += wy * z
+        rows[row, MOMENT + 5] += wz * z
 
 
 @compiled
@@ -191,8 +168,9 @@ def insert(
     `halves` is `rows` seen as 32-bit numbers. Normals (n, 3) and variances (n,) may be empty: then they count as zero.
     Returns the next point and the number of rows.
     """
-    limit = min(rows.shape[0], index.shape[0] // 2)
-    n = keys.shape[0]
+    limit, n = min(rows.shape[0], index.shape[0] // 2), keys.shape[0]
+    full = rows.shape[1] == FULL_WORDS
+    with_normals, with_variances = full and normals.shape[0] > 0, full and variances.shape[0] > 0
     # the voxels of the row of pixels before: most are met again, and need no search then
     near_keys, near_rows = np.zeros(1 << _NEAR_BITS, dtype=np.int64), np.empty(1 << _NEAR_BITS, dtype=np.int32)
     last_key, row = np.int64(0), np.int64(0)
@@ -209,22 +187,34 @@ def insert(
             key = keys[i]
             if key != last_key:
                 near = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - _NEAR_BITS))
-                if near_keys[near] == key:
-                    row = np.int64(near_rows[near])
-                else:
+                if near_keys[near] != key:
                     slot = _slot_of(index, rows, key)
                     if index[slot] == 0:
                         if n_rows >= limit:
                             return i, n_rows
                         _new_row(index, slot, rows, n_rows, key)
                         n_rows += 1
-                    row = np.int64(index[slot] & np.uint32(_ROW_MASK)) - 1
-                    near_keys[near], near_rows[near] = key, row
+                    near_keys[near], near_rows[near] = key, np.int32(np.int64(index[slot] & np.uint32(_ROW_MASK)) - 1)
+                row = np.int64(near_rows[near])
                 last_key = key
                 if halves[row, LAST_SCAN] != scan:
                     halves[row, LAST_SCAN] = scan
                     halves[row, SCANS] += 1
-            _add_point(rows, halves, row, i, fractions, weights, normals, variances, fates)
+            w = np.int64(weights[i])
+            if halves[row, WEIGHT] >= WEIGHT_LIMIT:
+                fates[CROWDED] += 1
+                i += 1
+                continue
+            # in this loop and in no function of its own: a call with seven arrays costs more than the sums
+            halves[row, COUNT] += 1
+            halves[row, WEIGHT] += np.int32(w)
+            _add_place(rows, row, w, fractions, i)
+            if with_normals:
+                rows[row, NORMAL] += w * np.int64(normals[i, 0])
+                rows[row, NORMAL + 1] += w * np.int64(normals[i, 1])
+                rows[row, NORMAL + 2] += w * np.int64(normals[i, 2])
+            if with_variances:
+                rows[row, VARIANCE] += w * np.int64(variances[i])
             i += 1
     return n, n_rows
 
