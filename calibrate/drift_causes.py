@@ -27,8 +27,8 @@ from drivers.kinematics.se3 import FloatArray
 
 HAND_EYE, CAMERA, SPHERE, SHOT = "hand-eye", "camera", "sphere moved", "single shot"
 
-FALSE_ALARM = 0.005
-"""Chance of an alarm where nothing changed, by the sum over all tests; 0.9 % is what 700 unchanged checks of 200 cells gave (docs/check.md)."""
+FALSE_ALARM = 0.009
+"""Chance of an alarm where nothing changed, by the sum over all tests; 1.2 % is what 940 unchanged checks of 260 cells gave (docs/check.md)."""
 _ALIKE_SIGMAS, _GENEROUS = 1.5, 8.0
 """A cause that can imitate another to within so much, by sizes of up to so many times the usual ones, is told beside it."""
 _SHARE = 0.025

@@ -12,6 +12,8 @@ from tests.support.drifting import CAUSES, after_two, check_shots, checked_cell,
 
 N_CELLS, FIRST_SEED = 100, 62_000
 TWO = (HAND_EYE, "axis 3")
+N_QUIET = 4
+"""Checks of an unchanged cell."""
 
 
 @pytest.mark.qualify
@@ -25,6 +27,8 @@ def test_changes_are_detected_and_named() -> None:
             diagnosis, together = told_of(checked, shots)
             names.append(named(diagnosis, 6))
             n_two["one cause"] += together is not None
+        # rare things want more draws than cells
+        told[None] += [named(told_of(checked, check_shots(checked, None, np.random.default_rng([seed, k, 5])))[0], 6) for k in range(N_QUIET - 1)]
         _, together = told_of(checked, after_two(checked, TWO, np.random.default_rng([seed, 4])))
         n_two["two causes"] += together is not None and {*together.pairs[0].causes} == {*TWO}
         print(f"\nqualify quick check seed={seed}: " + "; ".join(f"{cause}: {names[-1]}" for cause, names in told.items()), end="", flush=True)
@@ -38,7 +42,7 @@ def test_changes_are_detected_and_named() -> None:
     print(f"\nqualify quick check told as two: {n_two['one cause']} single changes, {n_two['two causes']} of {N_CELLS} of {TWO}", end="")
     assert n_two["one cause"] <= 0.02 * len(told) * N_CELLS
     assert n_two["two causes"] >= 0.85 * N_CELLS
-    assert sum(bool(name) for name in told[None]) < 0.03 * N_CELLS
+    assert sum(bool(name) for name in told[None]) < 0.03 * N_QUIET * N_CELLS
     for cause in CAUSES:
         assert sum(bool(name) for name in told[cause]) >= 0.95 * N_CELLS, cause
         assert sum(name == (cause,) for name in told[cause]) >= 0.85 * N_CELLS, cause
