@@ -39,6 +39,8 @@ _LEAST_OVERLAP = 0.3
 _PAIRS_PER_SCAN = 4
 _LEAST_POINTS = 200
 _REACH_MM = 3.0
+_EDGE_CELL_MM, _LEAST_AGREEING = 4.5, 0.97
+"""A bore of 12 mm radius stays, a step does not: registered with their rims, scans slid along planes by what rims are worth."""
 _BOUND = 27.9
 """Of the squared Mahalanobis distance of a scan's motion: 99.99 % of a Gaussian in six dimensions."""
 _COVERAGE = 2.0
@@ -105,10 +107,18 @@ def surface_of(shot: Shot, xyz_in_camera_mm: NDArray[np.float32], scan: Prepared
     grid = VoxelGrid(VOXEL_MM)
     grid.add(scan.points_in_base_mm, weights=scan.weights, normals=scan.normals)
     fused = grid.fused()
-    kept = np.isfinite(fused.normals).all(axis=1)
+    kept = np.flatnonzero(np.isfinite(fused.normals).all(axis=1))
+    kept = kept[_off_edges(fused.points_mm[kept], fused.normals[kept].astype(np.float64))]
     used = xyz_in_camera_mm.reshape(-1, 3)[scan.weights.reshape(-1) > 0]
     middle = used.mean(axis=0, dtype=np.float64) if len(used) else np.array([0.0, 0.0, 1.0])
     return ScanSurface(shot, fused.points_mm[kept], fused.normals[kept].astype(np.float64), np.asarray(middle, dtype=np.float64))
+
+
+def _off_edges(points_mm: FloatArray, normals: FloatArray) -> NDArray[np.bool_]:
+    """Which points (n, 3) lie where normals (n, 3) hardly turn: rims are rounded and cut short by each view in its own way."""
+    _, cell, count = np.unique(np.floor(points_mm / _EDGE_CELL_MM).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(cell.reshape(-1), along, minlength=len(count)) for along in normals.T], axis=1)
+    return np.asarray((np.linalg.norm(sums, axis=1) > _LEAST_AGREEING * count)[cell.reshape(-1)])
 
 
 def refine(system: StitchingSystem, surfaces: Sequence[ScanSurface]) -> Refinement:
