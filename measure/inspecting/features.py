@@ -12,7 +12,7 @@ from drivers.errors import DataError
 from drivers.kinematics import se3
 from drivers.kinematics.se3 import FloatArray
 from measure.inspecting.edges import rim_points
-from measure.inspecting.fitting import Fit, FitPoints, fit_shape
+from measure.inspecting.fitting import Fit, FitPoints, fit_shape, place_shape
 from measure.inspecting.patches import IntArray
 from measure.inspecting.shapes import ConeShape, Hollow, PlaneShape, Shape, SphereShape, StadiumShape, cylinder, frame_about
 from measure.inspecting.spec import CircleFeature, ConeFeature, CylinderFeature, Feature, PlaneFeature, SlotFeature, SphereFeature
@@ -74,19 +74,37 @@ def fit_feature(name: str, feature: Feature, cloud: PartCloud, others: Mapping[s
     Raises:
         DataError: too few points, or they leave it open.
     """
+    shape, points = _sought(name, feature, cloud, others)
+    fit = fit_shape(shape, points, name=name)
+    if not _by_rim(feature):
+        return fit
+    # what moves the whole rim alike shows in no residual: half the spacing's width, as a rectangle
+    doubt = np.zeros_like(fit.noise_covariance)
+    doubt[shape.names.index("radius"), shape.names.index("radius")] = points.voxel_mm**2 / 3
+    # a rim is seen by whoever sees the surface round it
+    return replace(fit, noise_covariance=fit.noise_covariance + doubt, response=replace(fit.response, surface=None))
+
+
+def place_feature(name: str, feature: Feature, cloud: PartCloud, others: Mapping[str, Feature]) -> tuple[Shape, FloatArray]:
+    """Shape and parameters of `fit_feature` alone; arguments and errors are its own."""
+    shape, points = _sought(name, feature, cloud, others)
+    return shape, place_shape(shape, points, name=name)
+
+
+def _sought(name: str, feature: Feature, cloud: PartCloud, others: Mapping[str, Feature]) -> tuple[Shape, FitPoints]:
+    """A feature's nominal shape and the points in its region."""
     shape = shape_of(feature, others)
-    rows = points_near(shape, cloud, any_normal=isinstance(feature, CircleFeature | SlotFeature) and feature.use == "edge")
-    if isinstance(feature, CircleFeature | SlotFeature) and feature.use == "edge":
-        if not isinstance(shape, StadiumShape):  # what `shape_of` makes of an outline
-            raise TypeError(type(shape))
-        points, rows, spacing_mm = rim_points(shape, cloud.points_mm, rows, name)
-        fit = fit_shape(shape, FitPoints(points, np.ones(len(rows)), rows, spacing_mm), name=name)
-        # what moves the whole rim alike shows in no residual: half the spacing's width, as a rectangle
-        doubt = np.zeros_like(fit.noise_covariance)
-        doubt[shape.names.index("radius"), shape.names.index("radius")] = spacing_mm**2 / 3
-        # a rim is seen by whoever sees the surface round it
-        return replace(fit, noise_covariance=fit.noise_covariance + doubt, response=replace(fit.response, surface=None))
-    return fit_shape(shape, FitPoints(cloud.points_mm[rows], cloud.weights[rows], rows, cloud.voxel_mm), name=name)
+    rows = points_near(shape, cloud, any_normal=_by_rim(feature))
+    if not _by_rim(feature):
+        return shape, FitPoints(cloud.points_mm[rows], cloud.weights[rows], rows, cloud.voxel_mm)
+    if not isinstance(shape, StadiumShape):  # what `shape_of` makes of an outline
+        raise TypeError(type(shape))
+    points, rows, spacing_mm = rim_points(shape, cloud.points_mm, rows, name)
+    return shape, FitPoints(points, np.ones(len(rows)), rows, spacing_mm)
+
+
+def _by_rim(feature: Feature) -> bool:
+    return isinstance(feature, CircleFeature | SlotFeature) and feature.use == "edge"
 
 
 def points_near(shape: Shape, cloud: PartCloud, *, any_normal: bool = False) -> IntArray:

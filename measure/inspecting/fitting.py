@@ -135,6 +135,24 @@ class FitPoints:
         return FitPoints(self.in_part_mm[kept], self.weights[kept], self.rows[kept], self.voxel_mm)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Where a shape lies, and the points that it rests on."""
+
+    params: FloatArray
+    local: FloatArray
+    """(n, 3) kept, in the shape's own frame."""
+    points: FitPoints
+    """The same, weighted for the fit."""
+    mixture: Mixture
+    n_left_out: int
+
+
+def place_shape(shape: Shape, points: FitPoints, *, name: str) -> FloatArray:
+    """Parameters of `fit_shape` alone, for who asks for no uncertainty; arguments and errors are its own."""
+    return _find(shape, points, name).params
+
+
 def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
     """Fit a shape to its points.
 
@@ -146,6 +164,17 @@ def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
     Raises:
         DataError: too few points, or they leave the shape open.
     """
+    found = _find(shape, points, name)
+    params, local, used, mixture = found.params, found.local, found.points, found.mixture
+    chance = mixture.chances(shape.distances(params, local).residual_mm)
+    described = _described(shape, params, local, replace(used, weights=used.weights * chance), found.n_left_out)
+    # strays pull to one side: what a narrower look at the surface changes is not known better than that
+    core = np.abs(shape.distances(params, local).residual_mm) <= max(_CORE * mixture.sigma_mm, _VOXELS * points.voxel_mm)
+    pulled = fit_step(shape.distances(params, local[core]), used.weights[core], name)
+    return replace(described, noise_covariance=described.noise_covariance + np.outer(pulled, pulled))
+
+
+def _find(shape: Shape, points: FitPoints, name: str) -> _Found:
     local = se3.apply(shape.local_from_part, points.in_part_mm)
     _require_enough(int((points.weights > 0).sum()), shape, "lie where the feature should be", name)
     least_sigma_mm = max(_VOXELS * points.voxel_mm / _CUT, _SMALLEST_SCALE_MM)
@@ -158,12 +187,7 @@ def fit_shape(shape: Shape, points: FitPoints, *, name: str) -> Fit:
     _require_enough(len(local), shape, "make a surface where the feature should be", name)
     params = _least_squares(shape, local, used.weights, robust, mixture, name)
     _require_near_nominal(shape, params, name)
-    chance = mixture.chances(shape.distances(params, local).residual_mm)
-    described = _described(shape, params, local, replace(used, weights=used.weights * chance), len(kept) - len(local))
-    # strays pull to one side: what a narrower look at the surface changes is not known better than that
-    core = np.abs(shape.distances(params, local).residual_mm) <= max(_CORE * mixture.sigma_mm, _VOXELS * points.voxel_mm)
-    pulled = fit_step(shape.distances(params, local[core]), used.weights[core], name)
-    return replace(described, noise_covariance=described.noise_covariance + np.outer(pulled, pulled))
+    return _Found(params, local, used, mixture, len(kept) - len(local))
 
 
 def _tapered(shape: Shape, local: FloatArray, voxel_mm: float) -> FloatArray:

@@ -15,7 +15,7 @@ from measure.gauge.correlation import Correlation
 from measure.inspecting.alignment import BestFit, best_fit, datum_alignment
 from measure.inspecting.cloud import MeasuredCloud
 from measure.inspecting.distance import NominalSurface
-from measure.inspecting.features import PartCloud, fit_feature, shape_of
+from measure.inspecting.features import PartCloud, fit_feature, place_feature, shape_of
 from measure.inspecting.fitting import Fit, Response
 from measure.inspecting.form import Form, form_of, with_form
 from measure.inspecting.geometry import element_of, nominal_element
@@ -159,9 +159,9 @@ def _datum_step(spec: InspectionSpec, cloud: PartCloud, wider: float) -> FloatAr
     for name in names:
         feature = spec.features[name]
         searched = feature.model_copy(update={"search_mm": feature.search_mm * wider})
-        fit = fit_feature(name, searched, cloud, spec.features)
-        measured[name] = element_of(feature, fit.shape, fit.params)
-        drawn[name] = nominal_element(feature, fit.shape)
+        shape, params = place_feature(name, searched, cloud, spec.features)
+        measured[name] = element_of(feature, shape, params)
+        drawn[name] = nominal_element(feature, shape)
     return datum_alignment(names, measured, drawn)
 
 
