@@ -8,9 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibrate.observations import Observations, SphereShot
+from calibrate.result import Calibration
+from drivers.kinematics.se3 import FloatArray
+from tests.qualify.test_design import chosen_or_random
 from tests.support.bound import recover
 from tests.support.unseen import random_unseen_lengths
-from tests.support.volume import UNSEEN, calibrated, random_shots, volume_cell
+from tests.support.volume import UNSEEN, calibrated, observed, random_shots, volume_cell
 
 pytestmark = pytest.mark.qualify
 
@@ -88,3 +92,44 @@ def test_recalibrations_hardly_move_a_point_by_more_than_its_uncertainty() -> No
     )
     assert (share <= 1.0).mean() >= 0.99
     assert share.max() <= 1.5
+
+
+PLANNED_SEED, N_PLANNED, LARGEST_MOTION_MM = 9190, 300, 0.03
+
+
+def test_recalibrations_on_one_plan_move_no_feature_by_more_than_0_03_mm() -> None:
+    """As a plant does it: the same plan again and again. Features are spheres at places that no calibration sees, of six views each.
+
+    What moves them is the robot's repeatability, shared out by the shots: 120 chosen ones leave 0.015 mm rms and up to
+    0.037 mm (two cells, 20 calibrations each), 300 leave 0.012 and 0.027.
+    """
+    joints, spheres, volume, _ = chosen_or_random(PLANNED_SEED, N_PLANNED, "chosen")
+    test = random_shots(volume, tuple(UNSEEN), 6, np.random.default_rng(PLANNED_SEED), noise=False, n_points=50)
+    features, expanded = [], []
+    for number in range(N_RECALIBRATIONS):
+        rng = np.random.default_rng([PLANNED_SEED, number])
+        pairs = enumerate(zip(joints, spheres, strict=True))
+        shots = tuple(observed(volume, name, q, rng, index=i, n_points=300) for i, (q, name) in pairs)
+        found = calibrated(volume, Observations(shots, ()))
+        places, uncertainties = zip(*(_feature(found, [s for s in test.shots if s.sphere == name]) for name in UNSEEN), strict=True)
+        features.append(places)
+        expanded.append(uncertainties)
+    where = np.array(features)
+    moved = np.linalg.norm(where - where.mean(axis=0), axis=-1)
+    share = (moved / np.array(expanded)).max()
+    print(f"\nqualify datum, one plan: rms {np.sqrt((moved**2).mean()):.4f} mm, largest {moved.max():.4f} mm, of its U {share:.2f}", end="")
+    assert share <= 1.0
+    assert moved.max() <= LARGEST_MOTION_MM
+
+
+def _feature(calibration: Calibration, views: list[SphereShot]) -> tuple[FloatArray, float]:
+    """Place (3,) of a sphere's centre as some views measure it together, and its U in the worst direction."""
+    places, jacobians = [], []
+    for shot in views:
+        assert shot.centre_in_camera_mm is not None
+        point = shot.centre_in_camera_mm[None]
+        places.append(calibration.points_in_base_mm(point, joints_rad=shot.joints_rad)[0])
+        jacobians.append(calibration.point_jacobian(point, joints_rad=shot.joints_rad)[0])
+    jacobian = np.mean(jacobians, axis=0)
+    used = calibration.covariance[: jacobian.shape[-1], : jacobian.shape[-1]]
+    return np.mean(places, axis=0), 2 * float(np.sqrt(np.linalg.eigvalsh(jacobian @ used @ jacobian.T)[-1]))
