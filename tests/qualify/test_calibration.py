@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -94,23 +95,26 @@ def test_recalibrations_hardly_move_a_point_by_more_than_its_uncertainty() -> No
     assert share.max() <= 1.5
 
 
-PLANNED_SEED, N_PLANNED, LARGEST_MOTION_MM = 9190, 300, 0.03
+PLANNED_SEED, N_PLANNED, LARGEST_MOTION_MM = 9190, 120, 0.03
 
 
-def test_recalibrations_on_one_plan_move_no_feature_by_more_than_0_03_mm() -> None:
-    """As a plant does it: the same plan again and again. Features are spheres at places that no calibration sees, of six views each.
+def test_recalibrations_with_the_first_session_move_no_feature_by_more_than_0_03_mm() -> None:
+    """As a plant does it where `check` finds nothing changed: the same plan anew, calibrated together with the first session.
 
-    What moves them is the robot's repeatability, shared out by the shots: 120 chosen ones leave 0.015 mm rms and up to
-    0.037 mm (two cells, 20 calibrations each), 300 leave 0.012 and 0.027.
+    Features are spheres at places that no calibration sees, of six views each. What moves them is the robot's
+    repeatability, shared out by the shots: alone, 120 chosen shots leave up to 0.04 mm and 300 up to 0.032.
     """
     joints, spheres, volume, _ = chosen_or_random(PLANNED_SEED, N_PLANNED, "chosen")
     test = random_shots(volume, tuple(UNSEEN), 6, np.random.default_rng(PLANNED_SEED), noise=False, n_points=50)
-    features, expanded = [], []
-    for number in range(N_RECALIBRATIONS):
+
+    def session(number: int) -> tuple[SphereShot, ...]:
         rng = np.random.default_rng([PLANNED_SEED, number])
-        pairs = enumerate(zip(joints, spheres, strict=True))
-        shots = tuple(observed(volume, name, q, rng, index=i, n_points=300) for i, (q, name) in pairs)
-        found = calibrated(volume, Observations(shots, ()))
+        numbered = enumerate(zip(joints, spheres, strict=True), start=N_PLANNED * number)
+        return tuple(replace(observed(volume, name, q, rng, index=i, n_points=300), session=f"s{number}") for i, (q, name) in numbered)
+
+    first, features, expanded = session(0), [], []
+    for number in range(1, N_RECALIBRATIONS + 1):
+        found = calibrated(volume, Observations(first + session(number), ()))
         places, uncertainties = zip(*(_feature(found, [s for s in test.shots if s.sphere == name]) for name in UNSEEN), strict=True)
         features.append(places)
         expanded.append(uncertainties)
