@@ -15,11 +15,12 @@ import numpy as np
 
 from acquire.cell import Cell
 from acquire.sphere import SphereFinding, SphereNotFound, SphereSettings, find_spheres
-from calibrate.observations import Observations, SphereShot, flange_pose, gather_observations, observe, sphere_shot
+from calibrate.observations import Observations, RejectedShot, SphereShot, flange_pose, gather_observations, observe, sphere_shot
 from calibrate.plausibility_closure import CLOSES_MM, close, recorded, useful_shots
 from calibrate.second_look_names import name_places, names_another
 from calibrate.start_closure import LEAST_SHOTS
 from calibrate.start_consensus import GATE_MM, Candidates, consensus_hand_eye
+from drivers.errors import DataError
 from drivers.files.session import Session, Shot, read_scan
 from drivers.kinematics import se3
 from drivers.kinematics.mdh import RobotModel
@@ -85,8 +86,32 @@ class _Looker:
 
 
 def see_sessions(sessions: Sequence[Session], *, cell: Cell, model: RobotModel | None) -> Observations:
-    """Both looks at all shots of some sessions; arguments and errors as of `gather_observations`."""
-    return look_again(sessions, gather_observations(sessions, cell=cell, model=model), cell=cell, model=model)
+    """Both looks at all shots of some sessions, a scan that two sessions hold once; arguments and errors as of `gather_observations`."""
+    seen = look_again(sessions, gather_observations(sessions, cell=cell, model=model), cell=cell, model=model)
+    return _each_once(sessions, seen)
+
+
+def _each_once(sessions: Sequence[Session], seen: Observations) -> Observations:
+    """Without copies: counted twice, a scan would make the calibration surer of itself than it is.
+
+    Raises:
+        DataError: a session holds nothing but scans of another.
+    """
+    folders = {session.digest: session.folder.name for session in sessions}
+    first: dict[tuple[str, str], SphereShot] = {}
+    copies: list[RejectedShot] = []
+    for shot in seen.shots:
+        original = first.setdefault((shot.scan_sha256, shot.sphere), shot)
+        if original.session != shot.session:
+            where = f"shot {original.index} of {folders.get(original.session, original.session[:12])}"
+            copies.append(RejectedShot(shot.session, shot.index, f"repeated: its scan is that of {where}, which counts once"))
+    if not copies:
+        return seen
+    gone = {(copy.session, copy.index) for copy in copies}
+    for whole in {copy.session for copy in copies} - {shot.session for shot in seen.shots if shot.key not in gone}:
+        message = f"the session {folders.get(whole, whole[:12])} holds nothing but scans of another one: they would count twice"
+        raise DataError(message, remedy="Name one of the two.")
+    return replace(seen, shots=tuple(shot for shot in seen.shots if shot.key not in gone), rejected=(*seen.rejected, *copies))
 
 
 def look_again(

@@ -249,3 +249,19 @@ def test_sessions_of_different_cells_are_a_data_error(shots: list[SyntheticShot]
         calibrate([read_session(folder) for folder in folders])
     assert told.value.file is not None
     assert "1" in Path(told.value.file).parent.name
+
+
+def test_a_scan_counts_once_however_many_sessions_hold_it(shots: list[SyntheticShot], plain: Calibration, tmp_path: Path) -> None:
+    """Twice the same 40 shots would make every uncertainty smaller by 1.4."""
+    whole, new = {"A": shots}, {"A": [*shots[:10], *draw_shots(CELL, np.random.default_rng(23), 5, n_points=100)]}
+    folders = [write_session(tmp_path / name, CELL, drawn, flange_from_camera=None) for name, drawn in (("s", whole), ("copy", whole), ("part", new))]
+    config = folders[1] / "session.yaml"
+    config.write_text(config.read_text(encoding="utf-8").replace("created_utc: '20", "created_utc: '19"), encoding="utf-8")
+    first, copy, part = map(read_session, folders)
+    assert first.digest != copy.digest
+    with pytest.raises(DataError, match="nothing but scans of another"):
+        calibrate([first, copy], PILLOW)
+    found = calibrate([part, first], PILLOW)
+    assert (found.statistics.n_shots, found.statistics.used) == (55, 45)
+    assert {"repeated" in shot.reason for shot in found.rejected} == {True}
+    assert len(found.rejected) == 10
