@@ -43,8 +43,11 @@ lint: $(VENV)/.installed-dev
 
 # One BLAS thread a process: two processes share two cores, and on matrices this small more threads gain nothing and were seen to stall.
 # Idle workers take over what busy ones have not begun: some tests wait for seconds, others compute.
-test: lint
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal
+# Types are checked beside the tests: alone, mypy leaves one core idle. Either of the two fails the whole.
+test: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy & types=$$!; OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist worksteal; tests=$$?; wait $$types && exit $$tests
 
 qualify: $(VENV)/.installed-dev
 	$(BIN)/pytest -m qualify -s

@@ -106,7 +106,7 @@ def spoil_header(scan: Path, session: Path, rng: random.Random) -> None:
 
 def test_spoilt_files_are_told(spoil_and_run: Callable[[random.Random], None]) -> None:
     rng = random.Random(20231122)
-    for _ in range(60):
+    for _ in range(30):
         spoil_and_run(rng)
 
 

@@ -103,6 +103,7 @@ def test_a_line_profile_sensor_is_refused_with_the_method_that_takes_it() -> Non
     assert "clouds" in str(told.value.remedy)
 
 
+@pytest.mark.qualify
 def test_intervals_of_unseen_lengths_cover(tmp_path: Path) -> None:
     """As in `test_coverage`; one length in a calibration would be fairer, and dearer."""
     settings = {"n_shots": 34, "n_points": 60, "n_lengths": 10}

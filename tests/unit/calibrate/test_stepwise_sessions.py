@@ -86,6 +86,7 @@ def test_pose_only_sessions_solve_the_hand_eye_block(pose_only_session: Path) ->
     assert np.abs(error[:3, :3] - np.eye(3)).max() < 2e-3
 
 
+@pytest.mark.qualify
 def test_a_certified_length_is_not_used_and_the_verdict_says_so(tmp_path: Path) -> None:
     cell, rng = paper_cell(), np.random.default_rng(10)
     there = replace(cell, centre_in_base_mm=np.array([820.0, -250.0, 380.0]))
