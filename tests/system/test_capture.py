@@ -123,6 +123,7 @@ def test_step_by_step_a_pose_is_taken_skipped_or_the_end(small: SmallCell, tmp_p
     assert process.returncode == 0
 
 
+@pytest.mark.qualify
 def test_ctrl_c_ends_after_the_shot_and_the_run_can_be_resumed(small: SmallCell, tmp_path: Path) -> None:
     cell, plan = real_time_cell(small, tmp_path, 6.0, 0.05)
     process = started([cell, plan, "-o", tmp_path / "s", "--yes", "--json"])
@@ -248,6 +249,7 @@ def test_ctrl_c_at_a_terminal_pauses_and_the_same_process_goes_on(small: SmallCe
     assert sum(shot.replaces is not None for shot in read_session(tmp_path / "s").all_shots) == 1
 
 
+@pytest.mark.qualify
 def test_a_run_goes_beyond_its_plan_until_enough_is_known(small: SmallCell, tmp_path: Path, cli: Cli) -> None:
     plan = load_plan(small.folder / "calibration_plan.yaml")
     write_plan(type(plan)(plan.cell_sha256, plan.purpose, plan.poses[:20]), tmp_path / "plan.yaml")

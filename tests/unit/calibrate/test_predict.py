@@ -34,6 +34,7 @@ def length_rms_mm(prediction: ArtefactPrediction) -> float:
     return prediction.predicted.length_rms_mm
 
 
+@pytest.mark.qualify
 def test_artefacts_stand_in_the_order_they_are_really_in(found: dict[str, ArtefactPrediction]) -> None:
     rms = {name: length_rms_mm(p) for name, p in found.items()}
     assert rms["five spheres"] < min(rms["bar in three orientations"], rms["three spheres"])
