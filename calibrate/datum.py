@@ -101,11 +101,6 @@ def base_motion(
     return np.concatenate([of_robot[:, :n_links], np.zeros((6, n_between)), of_robot[:, n_links:]], axis=1)
 
 
-def base_columns(points_in_base_mm: FloatArray) -> FloatArray:
-    """(..., 3, 6) motion of points (..., 3) per left twist of their base."""
-    return np.concatenate([np.broadcast_to(np.eye(3), (*points_in_base_mm.shape, 3)), -se3.hat(points_in_base_mm)], axis=-1)
-
-
 def datum_jacobian(
     datum: Datum, model: RobotModel | None, link_twists: FloatArray, terms: tuple[RobotTerm, ...] = (), terms_rad: FloatArray | None = None
 ) -> FloatArray:
@@ -130,7 +125,7 @@ def _fit_step(base_from_flange: FloatArray, points_in_flange_mm: FloatArray, wan
     """(12, k): left twist of the base, then right twist of the flange, that best cause motions (3 p m, k) of carried points."""
     points = _carried(base_from_flange, points_in_flange_mm)
     rotation = base_from_flange[:, None, :3, :3]
-    of_base = base_columns(points)
+    of_base = se3.point_columns(points)
     of_flange = np.concatenate([np.broadcast_to(rotation, (*points.shape, 3)), -rotation @ se3.hat(points_in_flange_mm)], axis=-1)
     design = np.concatenate([of_base, of_flange], axis=-1).reshape(-1, 12)
     scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3] * 2)

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibrate.datum import Datum, References, base_columns, best_fit_datum, nominal_robot_datum
+from calibrate.datum import Datum, References, best_fit_datum, nominal_robot_datum
 from calibrate.normal import symmetric_inverse
 from calibrate.problem import Problem, State
 from drivers.errors import SettingsError
@@ -125,7 +125,7 @@ def _by_spheres(choice: DatumChoice, problem: Problem, state: State, names: Sequ
     rows = [list(names).index(name) for name in choice.spheres]
     solved = state.centres_in_base_mm[rows]
     base_from_solver = se3.fit_rigid(solved, wanted)
-    fit = -np.linalg.pinv(base_columns(solved).reshape(-1, 6))
+    fit = -np.linalg.pinv(se3.point_columns(solved).reshape(-1, 6))
     layout = problem.layout
     own = np.concatenate([np.arange(3) + layout.centres.start + 3 * row for row in rows])
     known = slice(0, layout.n_geometric)

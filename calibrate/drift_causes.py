@@ -154,7 +154,7 @@ def _spheres(residuals: CheckResiduals, sphere_names: Sequence[str]) -> Cause:
         in_base = residuals.geometry.base_from_camera @ np.concatenate([residuals.geometry.centre_in_camera_mm, np.ones((m, 1))], axis=1)[..., None]
         points = in_base[:, :3, 0]
         middle = points.mean(axis=0)
-        rigid = -np.concatenate([np.broadcast_to(np.eye(3), (m, 3, 3)), -se3.hat(points - middle)], axis=-1).reshape(3 * m, 6)
+        rigid = -se3.point_columns(points - middle).reshape(3 * m, 6)
         names = tuple(f"stand.{part}" for part in ("x_mm", "y_mm", "z_mm", "about_x_rad", "about_y_rad", "about_z_rad"))
         shapes.append(Shape(rigid, np.array([_SPHERE_MM] * 3 + [_STAND_RAD] * 3), names))
     return Cause(SPHERE, tuple(shapes))

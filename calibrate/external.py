@@ -67,13 +67,13 @@ def external_rows(problem: Problem, state: State) -> ExternalRows | None:
     flange = frames[:, -1]
     seen = se3.apply(flange, state.target_in_flange_mm[points.target])
     told = se3.apply(state.base_from_reference[points.reference], points.points_in_reference_mm)
-    noise_columns = np.concatenate([np.broadcast_to(np.eye(3), (points.n_shots, 3, 3)), -se3.hat(seen - flange[:, :3, 3])], axis=-1)
+    noise_columns = se3.point_columns(seen - flange[:, :3, 3])
     pose_noise = state.pose_noise[problem.n_scans - points.n_stops :][points.stop]
     columns = np.zeros((points.n_shots, 3, layout.size))
     columns[:, :, layout.links] = link_columns(state.link_twists, frames, seen)
     if problem.terms:
         columns[:, :, layout.terms] = term_columns(state.link_twists, frames, points.load, seen)
-    of_frame = np.concatenate([-np.broadcast_to(np.eye(3), (points.n_shots, 3, 3)), se3.hat(told)], axis=-1)
+    of_frame = -se3.point_columns(told)
     for axis in range(6):
         columns[rows, :, layout.references.start + 6 * points.reference + axis] = of_frame[:, :, axis]
     for axis in range(3):

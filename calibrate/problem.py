@@ -276,7 +276,7 @@ def linearise_geometry(problem: Problem, state: State) -> Geometry:
     base_from_camera = base_from_flange @ state.flange_from_camera
     centre = state.centres_in_base_mm[problem.sphere]
     lever = centre - base_from_flange[:, :3, 3]
-    noise_columns = np.concatenate([np.broadcast_to(np.eye(3), (problem.n_shots, 3, 3)), -se3.hat(lever)], axis=-1)
+    noise_columns = se3.point_columns(lever)
     noise = np.einsum("mij,mj->mi", noise_columns, state.pose_noise[problem.scan])
     moving_point = centre - noise
     camera_from_base_rotation = np.swapaxes(base_from_camera[:, :3, :3], -1, -2)

@@ -20,7 +20,7 @@ from calibrate.budget import ErrorBudget
 from calibrate.camera_error import CameraError
 from calibrate.camera_field import SHAPE as SEEN_SHAPE
 from calibrate.camera_field import CameraField, SeenCells, camera_field, correction_mm
-from calibrate.datum import Datum, base_columns, base_motion, link_columns, term_columns, twist_columns
+from calibrate.datum import Datum, base_motion, link_columns, term_columns, twist_columns
 from calibrate.external_result import ExternalResult
 from calibrate.identifiability import Identifiability
 from calibrate.normal import NoiseModel
@@ -203,7 +203,7 @@ class Calibration:
             blocks.append(term_columns(self.link_twists, frames, load_basis(self.terms, self.model, q), in_solver_base))
         moved = np.concatenate(blocks, axis=-1)
         if self.model is not None:
-            moved += base_columns(in_solver_base) @ self._base_motion()
+            moved += se3.point_columns(in_solver_base) @ self._base_motion()
         return np.asarray(self.datum.base_from_solver[:3, :3] @ moved)
 
     def _base_motion(self) -> FloatArray:
@@ -269,9 +269,9 @@ class Calibration:
         pose, point = self.noise_covariances_mm2(points, flange)
         if self.datum.noise is None:
             return pose + point
-        in_base = se3.apply(flange @ self.flange_from_camera, self.corrected_points_in_camera_mm(points))
-        base = self.datum.base_from_solver
-        turned = base[:3, :3] @ base_columns(se3.apply(se3.inverse(base), in_base))
+        solver_from_camera = se3.inverse(self.datum.base_from_solver) @ flange @ self.flange_from_camera
+        in_solver_base = se3.apply(solver_from_camera, self.corrected_points_in_camera_mm(points))
+        turned = self.datum.base_from_solver[:3, :3] @ se3.point_columns(in_solver_base)
         return pose + point + turned @ self.datum.noise @ np.swapaxes(turned, -1, -2)
 
     def _flange(self, joints_rad: ArrayLike | None, base_from_flange: ArrayLike | None, n_points: int) -> FloatArray:

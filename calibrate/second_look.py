@@ -108,7 +108,7 @@ def _each_once(sessions: Sequence[Session], seen: Observations) -> Observations:
     if not copies:
         return seen
     gone = {(copy.session, copy.index) for copy in copies}
-    for whole in {copy.session for copy in copies} - {shot.session for shot in seen.shots if shot.key not in gone}:
+    for whole in sorted({copy.session for copy in copies} - {shot.session for shot in seen.shots if shot.key not in gone}):
         message = f"the session {folders.get(whole, whole[:12])} holds nothing but scans of another one: they would count twice"
         raise DataError(message, remedy="Name one of the two.")
     return replace(seen, shots=tuple(shot for shot in seen.shots if shot.key not in gone), rejected=(*seen.rejected, *copies))

@@ -31,14 +31,12 @@ def new_cell(
     """Write a cell file, by flags or, on a terminal, by questions."""
     with command(as_json, debug, quiet) as run:
         from acquire.cell import Cell
-        from drivers.errors import SettingsError
         from drivers.files.disk import write_text_atomic
         from drivers.files.schema import check
         from drivers.files.yaml import parse_yaml
         from measure.cell_text import CellAnswers, cell_text
 
-        if out.exists() and not force:
-            raise SettingsError("exists already", file=out, remedy="Name another file with -o, or replace it with --force.")
+        _require_new(out, force)
         ask = run.console.shows_results and sys.stdin.isatty() and sys.stdout.isatty()
         answers = CellAnswers(
             name=name or _asked(ask, "Name of the cell", "cell"),
@@ -68,16 +66,21 @@ def new_truth(
     """Draw what a simulated cell truly is, for `driver: simulated` and `simulate-controller --cell`."""
     with command(as_json, debug, quiet) as run:
         from acquire.cell import load_cell
-        from drivers.errors import SettingsError
         from drivers.simulated.truth_file import write_truth
         from measure.new_truth import truth_of_cell
 
-        if out.exists() and not force:
-            raise SettingsError("exists already", file=out, remedy="Name another file with -o, or replace it with --force.")
+        _require_new(out, force)
         truth = truth_of_cell(load_cell(cell), seed)
         write_truth(truth, out)
         run.console.say(f"{out} written: a robot and a camera with errors that nobody but the simulation may read")
         run.finish({"out": str(out), "spheres": list(truth.spheres)})
+
+
+def _require_new(out: Path, force: bool) -> None:
+    from drivers.errors import SettingsError
+
+    if out.exists() and not force:
+        raise SettingsError("exists already", file=out, remedy="Name another file with -o, or replace it with --force.")
 
 
 def _asked(ask: bool, question: str, default: str) -> str:

@@ -171,6 +171,12 @@ def nearest_rotation(matrix: ArrayLike) -> FloatArray:
     return np.asarray(u @ vt)
 
 
+def point_columns(points_mm: ArrayLike) -> FloatArray:
+    """(..., 3, 6) motion of points (..., 3) per left twist (mm, rad) of the frame that they are given in: [I, -hat(p)]."""
+    points = np.asarray(points_mm, dtype=np.float64)
+    return np.concatenate([np.broadcast_to(np.eye(3), (*points.shape, 3)), -hat(points)], axis=-1)
+
+
 def fit_rigid(source_mm: ArrayLike, target_mm: ArrayLike) -> FloatArray:
     """The `target_from_source` (4, 4) that maps points (n, 3) onto points (n, 3) best in least squares."""
     source, target = np.asarray(source_mm, dtype=np.float64), np.asarray(target_mm, dtype=np.float64)

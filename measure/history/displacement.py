@@ -143,7 +143,7 @@ def _region(calibration: Calibration) -> tuple[str, FloatArray]:
 
 def _rigid_part(points: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
     about = points - points.mean(axis=0)
-    design = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(about)], axis=-1).reshape(-1, 6)
+    design = se3.point_columns(about).reshape(-1, 6)
     scale = np.array([1.0, 1, 1, 1e-3, 1e-3, 1e-3])
     rigid = np.linalg.lstsq(design * scale, moved.reshape(-1), rcond=None)[0] * scale
     return rigid, (moved.reshape(-1) - design @ rigid).reshape(-1, 3)

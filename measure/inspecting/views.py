@@ -180,7 +180,7 @@ def _motion(calibration: KnowsItsErrors, views: Sequence[View], seen: Sequence[_
             motion = np.zeros((len(total), 3, n_parameters + 6 * len(views)))
         share = (one.n_points[taken] / total[taken])[:, None, None]
         flange = calibration.base_from_flange(pose["joints_rad"]) if "joints_rad" in pose else pose["base_from_flange"]
-        by_twist = np.concatenate([np.broadcast_to(np.eye(3), (len(taken), 3, 3)), -se3.hat(in_base_mm[taken] - flange[:3, 3])], axis=2)
+        by_twist = se3.point_columns(in_base_mm[taken] - flange[:3, 3])
         start = n_parameters + 6 * number
         motion[taken, :, :n_parameters] += share * jacobian[: len(taken)]
         motion[taken, :, start : start + 6] = share * by_twist

@@ -198,7 +198,7 @@ def _bend_variance_mm2(system: StitchingSystem, scan: ScanSurface) -> float:
     places = system.points_in_base_mm(nodes, **pose)
     moved = system.point_jacobian(nodes, **pose).reshape(3 * len(nodes), -1)
     levers = places - places.mean(axis=0)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(nodes), 3, 3)), -se3.hat(levers)], axis=-1).reshape(-1, 6) * _SCALE
+    rigid = se3.point_columns(levers).reshape(-1, 6) * _SCALE
     bent = moved - rigid @ np.linalg.lstsq(rigid, moved, rcond=None)[0]
     used = system.covariance[: bent.shape[1], : bent.shape[1]]
     return _COVERAGE**2 * float(np.einsum("ij,jk,ik->i", bent, used, bent).mean())
@@ -212,7 +212,7 @@ def _prior(system: StitchingSystem, scans: Sequence[ScanSurface], centre: FloatA
         nodes = scan.middle_in_camera_mm + _LEVERS_MM
         places = system.points_in_base_mm(nodes, **pose)
         moved = system.point_jacobian(nodes, **pose)
-        design = np.concatenate([np.broadcast_to(np.eye(3), (4, 3, 3)), -se3.hat(places - centre)], axis=-1).reshape(12, 6)
+        design = se3.point_columns(places - centre).reshape(12, 6)
         shares.append(np.linalg.lstsq(design * _SCALE, moved.reshape(12, -1), rcond=None)[0] * _SCALE[:, None])
         flange = np.asarray(scan.shot.base_from_flange if system.model is None else system.base_from_flange(np.asarray(scan.shot.joints_rad)))
         at_centre = np.eye(6)

@@ -180,3 +180,13 @@ def test_is_rigid_refuses(matrix: FloatArray) -> None:
 
 def test_is_rigid_takes_what_a_file_rounds() -> None:
     assert se3.is_rigid(np.round(transforms((), "any"), 7))
+
+
+def test_point_columns_are_the_derivative_by_a_left_twist() -> None:
+    rng = np.random.default_rng(8)
+    points = rng.normal(0, 300, (4, 5, 3))
+    columns = se3.point_columns(points)
+    for k, h in enumerate([1e-3] * 3 + [1e-6] * 3):
+        step = h * np.eye(6)[k]
+        moved = (se3.apply(se3.exp(step), points) - se3.apply(se3.exp(-step), points)) / (2 * h)
+        np.testing.assert_allclose(columns[..., k], moved, atol=1e-5)
